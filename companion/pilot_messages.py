@@ -192,6 +192,7 @@ REASONS: Mapping[str, str] = {
     "no autopilot attitude": "no attitude",
     "attitude is not believed": "attitude not used",
     "no autopilot height": "no height",
+    "camera mount is not known": "no camera mount",
     "position reset": "position reset",
     "no autopilot clock": "no clock",
     "another companion on the link": "second companion",

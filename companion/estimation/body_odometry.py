@@ -61,10 +61,13 @@ class BodyOdometry:
         """Odometry of a track of the active segment, in its own frame."""
         segment = self._tracker.map
         first = segment.keyframes.get(segment.first_keyframe_id)
+        view = self._tracker.view_of(track.seq)
+        seen = None if view is None else view.point_ids[view.point_ids >= 0]
         odometry = self._smooth.step(
             track, segment.first_keyframe_id, self._georeferences.of(segment),
             self._motion.velocity,
             None if first is None else MapView(first.t_ns, first.camera_from_map.inverse()),
+            None if seen is None else segment.born[seen],
         )  # fmt: skip
         return self._given(odometry)
 

@@ -87,7 +87,8 @@ class Odometry:
     None while lost or without a metric scale. `velocity_world_m_s` (3,); `sigma_position_m` is one
     standard deviation, along each axis, of the way of the last ten seconds, about as far back as an
     autopilot's filter remembers; by dead reckoning of the place since the last one that was seen,
-    too. `sigma_attitude_rad` is that of the tilt about each level axis,
+    too. `sigma_attitude_rad` is that of the tilt about each level axis, infinite where nobody says
+    how the camera sits on the body: then pose and velocity are the camera's,
     `sigma_yaw_rad` of the heading, against north; `quality` is 1..100, or -1 while the pose is
     unknown.
     """

@@ -156,6 +156,7 @@ OF_REASON: Mapping[str, str] = {
     "the autopilot is silent": "Nothing is heard of the autopilot: cable, baud.",
     "no autopilot attitude": "The autopilot sends no attitude: see its stream rates.",
     "attitude is not believed": "telemetry.use leaves out attitude.",
+    "camera mount is not known": "Say how the camera sits on the vehicle: Setup, or [mount].",
     "no autopilot height": "The autopilot sends no height: see its stream rates.",
     "position reset": "Wait a second: poses must be good for a while first.",
     "no autopilot clock": "Wait some seconds: the clocks are being compared.",

@@ -35,6 +35,8 @@ computer that was busy for a moment has lost nothing of where the body is."""
 MAX_SIGMA_SCALE = 0.05
 """Relative; with it velocities are 5 % off, 0.5 m/s at 10 m/s, which an autopilot's EKF takes for
 noise: ArduPilot's VISO_VEL_M_NSE is 0.1 m/s and more, its innovation gates are five of these."""
+SIGMA_ACCELERATION_M_S2 = 3.0
+"""Of a vehicle between two frames, whose velocity a prediction holds: 17 degrees of tilt."""
 HYSTERESIS = 0.8
 """To start sending, a pose must be better than the limits by this factor."""
 MAX_EXTENT_M = 1e5
@@ -60,6 +62,7 @@ RESTARTED = "localisation begins anew"
 RESET = "position reset"
 REBOOTED = "autopilot rebooted"
 NO_HEIGHT = "no autopilot height"
+NO_MOUNT = "camera mount is not known"
 PROVING = "belief must hold first"
 
 
@@ -279,6 +282,8 @@ class PoseGate:
             or not np.isfinite(odometry.sigma_velocity_m_s)  # the velocity is an old one
         ):
             return UNCERTAIN
+        if not np.isfinite(odometry.sigma_attitude_rad):
+            return NO_MOUNT
         hysteresis = 1.0 if self.sending else HYSTERESIS
         if not _sigma_place_m(odometry) <= hysteresis * self._config.max_sigma_m:
             return UNCERTAIN
@@ -368,13 +373,17 @@ class PoseGate:
         pose = replace(self._pose_of(accepted), t_ns=accepted.t_ns + ahead_ns, predicted=True)
         rotation = pose.world_from_body.rotation @ before.T @ now
         ahead_s = ahead_ns * 1e-9
-        grown_m = pose.sigma_velocity_m_s * ahead_s
+        changed_m_s = SIGMA_ACCELERATION_M_S2 * ahead_s
+        grown_m = float(np.hypot(pose.sigma_velocity_m_s, 0.5 * changed_m_s)) * ahead_s
         if not np.hypot(_sigma_place_m(accepted), grown_m) <= self._config.max_sigma_m:
             self._last_rejection = self._last_rejection or UNCERTAIN
             return None
         position = pose.world_from_body.translation + pose.velocity_world_m_s * ahead_s
-        sigma_m = float(np.hypot(pose.sigma_position_m, grown_m))
-        return replace(pose, world_from_body=Pose(rotation, position), sigma_position_m=sigma_m)
+        return replace(
+            pose, world_from_body=Pose(rotation, position),
+            sigma_position_m=float(np.hypot(pose.sigma_position_m, grown_m)),
+            sigma_velocity_m_s=float(np.hypot(pose.sigma_velocity_m_s, changed_m_s)),
+        )  # fmt: skip
 
     def _stamped(self, pose: PoseToSend) -> PoseToSend | None:
         """The same, if its stamp is later than the last sent."""

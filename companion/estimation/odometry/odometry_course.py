@@ -10,7 +10,7 @@ from companion.estimation.camera_motion import SIGMA_DEAD_RECKONING_M_S
 from companion.estimation.georeference.trajectory_alignment import SIGMA_YAW_RAD
 from companion.estimation.odometry.flown_map import FlownMap, LastPose
 from companion.estimation.odometry.innovation_gate import InnovationGate
-from companion.estimation.odometry.odometry_drift import OdometryDrift
+from companion.estimation.odometry.odometry_drift import ALONG_ONE, OdometryDrift
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Georeference, Odometry, Track, TrackState
 
@@ -50,6 +50,10 @@ class OdometryCourse:
         sigma_rad = float(SIGMA_YAW_RAD) if georeference is None else georeference.sigma_yaw_rad
         return float(np.linalg.norm([FLOOR_RAD, noise_rad, sigma_rad, self.flown.frame.yaw_rad]))
 
+    def sigma_by_scale_m_s(self, sigma_scale: float) -> float:
+        """Standard deviation of the velocity along each axis, by a scale that is off."""
+        return ALONG_ONE * sigma_scale * float(np.linalg.norm(self.velocity))
+
     def none(self, track: Track) -> Odometry:
         """Odometry without a pose."""
         return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
@@ -69,7 +73,8 @@ class OdometryCourse:
             track.seq, track.t_ns, TrackState.DEAD_RECKONING, self.reset_counter, 1, placed,
             reckoned.velocity_m_s,
             float(np.linalg.norm([FLOOR_M, reckoned.sigma_place_m, *drift])),
-            reckoned.sigma_velocity_m_s, SIGMA_ATTITUDE_RAD,
+            float(np.hypot(reckoned.sigma_velocity_m_s, self.sigma_by_scale_m_s(sigma_scale))),
+            SIGMA_ATTITUDE_RAD,
             self.sigma_yaw_rad(georeference, SIGMA_ATTITUDE_RAD), inertial=True,
             sigma_scale=sigma_scale, sigma_by_scale_m=drift.by_scale_m,
         )  # fmt: skip

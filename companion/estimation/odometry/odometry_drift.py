@@ -1,4 +1,10 @@
-"""Drift of the smooth odometry over its last seconds."""
+"""Drift of the smooth odometry over its last seconds.
+
+Each point of the map is as wrong as the poses that it was triangulated from. A pose by points that
+were known before drifts no further; where all that is in view is new, it is off by what a pose was
+off by when they were made. So drift is a random walk that takes a step, of the noise of a pose,
+each time that the view has been renewed.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +12,14 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array
 
 WINDOW_NS = 10_000_000_000
-SIGMA_DRIFT = 0.005
-"""Ratio of path length: drift of a map before adjustment."""
+SIGMA_CALIBRATION = 0.001
+"""Ratio of path length: what is wrong alike in all images, as a focal length known to a
+thousandth."""
 
 ALONG_ONE = float(np.sqrt(3.841 / 7.815))
 """A scale that is off shortens a straight way along one axis. Of chi-squares the bound of 95 % is
@@ -19,11 +27,12 @@ ALONG_ONE = float(np.sqrt(3.841 / 7.815))
 
 
 class _PathPoint(NamedTuple):
-    """Position, path length, and accumulated slew correction at a time."""
+    """Position, path length, variance of the walk, and accumulated slew correction at a time."""
 
     t_ns: int
     position: Array
     path_length_m: float
+    walked_m2: float
     slewed: Array
 
 
@@ -43,27 +52,43 @@ class OdometryDrift:
 
     def __init__(self) -> None:
         self._path: deque[_PathPoint] = deque()
+        self._newest_born, self._new_share = -1, 1.0
 
     def clear(self) -> None:
         """Forget the path, after a jump."""
         self._path.clear()
 
-    def add(self, t_ns: int, position: Array, sigma_scale: float, slewed: Array) -> Drift:
+    def see(self, born: NDArray[np.int64] | None) -> None:
+        """Tell known ground from new by the points in view of the frame that comes next.
+
+        `born` (N,) are the ids of the keyframes at which they were made; None if unknown.
+        """
+        if born is None or not len(born):
+            self._new_share = 1.0
+            return
+        self._new_share = float((born > self._newest_born).mean())
+        self._newest_born = max(self._newest_born, int(born.max()))
+
+    def add(
+        self, t_ns: int, position: Array, sigma_scale: float, slewed: Array, noise_m: float = 0.0
+    ) -> Drift:
         """Add a position (3,), metres, with all corrections (3,) so far; the drift up to it.
 
-        Standard deviations are along each axis.
+        `noise_m` is that of its image, 0 where it comes of none. Standard deviations are along each
+        axis.
         """
-        path_length_m = 0.0
+        path_length_m, walked_m2 = 0.0, 0.0
         if self._path:
-            path_length_m = self._path[-1].path_length_m + float(
-                np.linalg.norm(position - self._path[-1].position)
-            )
-        self._path.append(_PathPoint(t_ns, position, path_length_m, slewed))
+            last = self._path[-1]
+            path_length_m = last.path_length_m + float(np.linalg.norm(position - last.position))
+            walked_m2 = last.walked_m2 + self._new_share * noise_m**2
+        self._path.append(_PathPoint(t_ns, position, path_length_m, walked_m2, slewed))
         while self._path[0].t_ns < t_ns - WINDOW_NS:
             self._path.popleft()
         since = self._path[0]
+        calibration_m = SIGMA_CALIBRATION * (path_length_m - since.path_length_m)
         return Drift(
             ALONG_ONE * sigma_scale * float(np.linalg.norm(position - since.position)),
-            SIGMA_DRIFT * (path_length_m - since.path_length_m),
+            float(np.hypot(np.sqrt(max(walked_m2 - since.walked_m2, 0.0)), calibration_m)),
             float(np.linalg.norm(slewed - since.slewed)) / np.sqrt(3.0),
         )

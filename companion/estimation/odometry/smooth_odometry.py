@@ -7,6 +7,7 @@ of a stationary camera. Here the pose is continuous, and corrections are slew-li
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.estimation.body.aiding import AidedPlace
 from companion.estimation.body.body_filter import BodyFilter, Reckoned
@@ -46,6 +47,7 @@ class SmoothOdometry:
         min_quality: int = 1,
     ) -> None:  # fmt: skip
         mount = camera.body_from_camera
+        self._mounted = mount is not None
         self._course = OdometryCourse(
             mount.inverse() if mount is not None else Pose.identity(), max_jump_m, body
         )
@@ -89,12 +91,15 @@ class SmoothOdometry:
         georeference: Georeference | None,
         velocity_map: ImageVelocity | None,
         first: MapView | None = None,
+        born: NDArray[np.int64] | None = None,
     ) -> Odometry:
         """Odometry of the frame that has begun.
 
         `segment` identifies the map of the track, `georeference` is that of this map,
-        `velocity_map` the camera's velocity in it, and `first` its first view.
+        `velocity_map` the camera's velocity in it, and `first` its first view. `born` (N,) are the
+        keyframes at which the points in view were made.
         """
+        self._course.drift.see(born)
         found = (
             self._stand.odometry(track)
             if self.ground.stood is not None
@@ -184,14 +189,16 @@ class SmoothOdometry:
         course.velocity, sigma_velocity = found or (course.velocity, float("inf"))
         flown.last = LastPose(track.t_ns, pose, placed)
         drift = course.drift.add(
-            track.t_ns, placed.translation, georeference.sigma_scale, frame.slewed_m
-        )
+            track.t_ns, placed.translation, georeference.sigma_scale, frame.slewed_m,
+            noise_m,
+        )  # fmt: skip
         noise_rad = NOISE_INFLATION * track.sigma_rotation_rad
         return Odometry(
             track.seq, track.t_ns, track.state, course.reset_counter,
             quality, placed, course.velocity.copy(),
             float(np.linalg.norm([FLOOR_M, noise_m, *drift])),
-            sigma_velocity, float(np.hypot(FLOOR_RAD, noise_rad)),
+            float(np.hypot(sigma_velocity, course.sigma_by_scale_m_s(georeference.sigma_scale))),
+            float(np.hypot(FLOOR_RAD, noise_rad)) if self._mounted else float("inf"),
             course.sigma_yaw_rad(georeference, noise_rad),
             sigma_scale=georeference.sigma_scale, sigma_by_scale_m=drift.by_scale_m,
         )  # fmt: skip

@@ -15,6 +15,8 @@ SIGMA_ACCEL_M_S2, SIGMA_GYRO_RAD_S = 0.08, 0.004
 """White, at each sample; a small autopilot's in the vibration of its frame, at 100 Hz."""
 BIAS_ACCEL_M_S2, BIAS_GYRO_RAD_S = 0.06, 0.004
 """Of the bias of a flight, along each axis."""
+SIGMA_SENSITIVITY = 0.01
+"""Of each accelerometer's own scale: datasheets state 0.5 to 1 %."""
 SIGMA_ATTITUDE_RAD = np.radians(0.1)
 """White, about each axis."""
 SIGMA_TILT_RAD, TILT_TAU_S = np.radians(0.2), 20.0
@@ -29,12 +31,15 @@ def with_noise(samples: Iterable[Telemetry], seed: int) -> Iterator[Telemetry]:
     rng = np.random.default_rng(seed)
     bias_accel = rng.normal(scale=BIAS_ACCEL_M_S2, size=3)
     bias_gyro = rng.normal(scale=BIAS_GYRO_RAD_S, size=3)
+    sensitivity = 1.0 + np.random.default_rng([seed, 1]).normal(scale=SIGMA_SENSITIVITY, size=3)
     tilt, tilt_ns = rng.normal(scale=SIGMA_TILT_RAD, size=2), None
     for sample in samples:
         if isinstance(sample, ImuSample):
             yield replace(
                 sample,
-                accel_m_s2=sample.accel_m_s2 + bias_accel + rng.normal(0, SIGMA_ACCEL_M_S2, 3),
+                accel_m_s2=sensitivity * sample.accel_m_s2
+                + bias_accel
+                + rng.normal(0, SIGMA_ACCEL_M_S2, 3),
                 gyro_rad_s=sample.gyro_rad_s + bias_gyro + rng.normal(0, SIGMA_GYRO_RAD_S, 3),
             )
         elif isinstance(sample, AttitudeSample):

@@ -499,6 +499,19 @@ def test_a_bridge_goes_on_after_frames_that_came_too_late(late_s: float, resumes
     assert flight.state() is (Sending.BRIDGING if resumes else Sending.OFF)
 
 
+def test_a_velocity_that_is_held_is_less_certain_the_longer_it_is() -> None:
+    flight = Flight(period_ms=200)
+    flight.run(3)
+    poses = flight.run(1)
+    since_s = [(p.t_ns + LATENCY_NS) % (200 * MS) * 1e-9 for p in poses]
+    assert max(since_s) > 0.1
+    for pose, held_s in zip(poses, since_s, strict=True):
+        assert pose.predicted == (held_s > 0.0)
+        assert pose.sigma_velocity_m_s == pytest.approx(np.hypot(0.2, 3.0 * held_s))
+        grown_m = held_s * np.hypot(0.2, 1.5 * held_s)
+        assert pose.sigma_position_m == pytest.approx(np.hypot(0.1, grown_m))
+
+
 def test_a_pose_with_an_old_velocity_is_not_sent() -> None:
     """One of unknown certainty is not known: an autopilot would take it all the same."""
     flight = Flight()

@@ -27,3 +27,37 @@ def test_what_is_longer_ago_is_forgotten() -> None:
         north_m = min(1.0 * k, 10.0)  # stands from the tenth second on
         found = drift.add(k * 10**9, np.array([north_m, 0.0, 0.0]), SIGMA_SCALE, np.zeros(3))
     assert found.by_scale_m == found.by_map_m == 0.0
+
+
+@pytest.mark.parametrize("keyframes_a_view", [1, 2, 4, 8])
+def test_drift_over_new_ground_is_what_a_chain_of_views_drifts_by(keyframes_a_view: int) -> None:
+    """Points bear the error of the pose that made them, poses the mean one of what they see.
+
+    Many keyframes a view average their noise, which is not counted on.
+    """
+    rng, noise_m, squares = np.random.default_rng(keyframes_a_view), 0.05, []
+    for _ in range(300):
+        drift = OdometryDrift()
+        errors_m = [np.zeros(3)] * keyframes_a_view  # of the points of the keyframes in view
+        for k in range(3 * keyframes_a_view + 1):
+            drift.see(np.arange(k, k + keyframes_a_view))
+            found = drift.add(k * 10**8, np.zeros(3), 0.0, np.zeros(3), noise_m)
+            pose_m = np.mean(errors_m, axis=0) + rng.normal(scale=noise_m, size=3)
+            errors_m = [*errors_m[1:], pose_m]
+        squares.append(float((pose_m**2).sum()) / (found.by_map_m**2 + noise_m**2) / 3.0)
+    assert 0.3 < np.mean(squares) < 1.2
+
+
+def test_drift_stops_over_known_ground_and_goes_on_with_new_points() -> None:
+    drift = OdometryDrift()
+
+    def over(born: list[int], k: int) -> float:
+        drift.see(np.array(born, np.int64))
+        return drift.add(k * 10**8, np.zeros(3), 0.0, np.zeros(3), 0.1).by_map_m
+
+    first = [over([0, 0, 1, 1], k) for k in range(10)]
+    assert first[0] == first[-1] == 0.0
+    half_new = over([1, 1, 2, 2], 10)
+    assert half_new == pytest.approx(0.1 * np.sqrt(0.5))
+    assert over([0, 1, 2, 2], 11) == over([0, 1], 12) == half_new
+    assert over([], 13) > 0.1, "what is seen without a point that is known is not known ground"

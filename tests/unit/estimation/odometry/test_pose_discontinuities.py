@@ -16,7 +16,9 @@ from companion.geometry.transforms import Pose, Similarity
 from companion.messages import Georeference, Track, TrackState
 from companion.telemetry import AttitudeSample
 
-CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, body_from_camera=Pose.identity())
+KNOWN = np.zeros(200, np.int64)
+"""Keyframes at which the points of a frame were made: all of them before."""
 PLACED = Georeference(Similarity(1.0, np.eye(3), np.zeros(3)), 0.01, 0.01, "GPS", 50, 0.3)
 KEYPOINTS_PX = np.random.default_rng(1).uniform(0, 480, (200, 2)).astype(np.float32)
 SPEED_M_S = 2.0
@@ -59,7 +61,7 @@ class Flight:
             sigma_position=0.01, sigma_rotation_rad=0.001,
         )  # fmt: skip
         velocity = ImageVelocity(np.array([SPEED_M_S, 0.0, 0.0]), 0.1)
-        found = self.odometry.step(seen, 0, PLACED, velocity)
+        found = self.odometry.step(seen, 0, PLACED, velocity, born=KNOWN)
         self.reset_counter = found.reset_counter
         self._keep(self.gate.take(found, self.now_ns))
 

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from companion.config import FeedbackConfig
 from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.body.reckoning import BodyAttitude
 from companion.estimation.camera_motion import ImageVelocity
+from companion.estimation.gate.pose_gate import PoseGate
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.lift_off.optical_flow import GroundVelocity
 from companion.estimation.odometry.odometry_frame import MapView
@@ -19,7 +21,9 @@ from companion.geometry.transforms import Pose, Similarity, yaw_rotation
 from companion.messages import Georeference, Odometry, Track, TrackState
 from companion.telemetry import AttitudeSample, ImuSample
 
-CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, body_from_camera=Pose.identity())
+KNOWN = np.zeros(200, np.int64)
+"""Keyframes at which the points of a frame were made: all of them before."""
 PLACED = Georeference(Similarity(2.0, np.eye(3), np.zeros(3)), 0.01, 0.01, "GPS", 50, 0.3)
 SPEED = 1.0
 VELOCITY = ImageVelocity(np.array([SPEED, 0.0, 0.0]), 0.2)
@@ -42,12 +46,37 @@ def track(k: int, off: float = 0.0, state: TrackState = TrackState.TRACKING) -> 
 
 
 def give(odometry: SmoothOdometry, track: Track) -> Odometry:
-    return odometry.step(track, 0, PLACED, VELOCITY)
+    return odometry.step(track, 0, PLACED, VELOCITY, born=KNOWN)
 
 
 def north(odometry: Odometry) -> float:
     assert odometry.world_from_body is not None
     return float(odometry.world_from_body.translation[0])
+
+
+def test_a_camera_whose_mount_nobody_states_gives_no_pose_to_send() -> None:
+    """One that looks straight down is as level as the body, its heading wrong by anything."""
+    sent = []
+    for camera in (replace(CAMERA, body_from_camera=None), CAMERA):
+        odometry = SmoothOdometry(camera, 1.0, BodyFilter(AccelerationIntegral()))
+        gate = PoseGate(FeedbackConfig(mode="odometry", min_quality=1))
+        for k in range(60):
+            gate.take_attitude(AttitudeSample(k * 100_000_000, np.array([1.0, 0.0, 0.0, 0.0])))
+            found = give(odometry, track(k))
+            assert found.world_from_body is not None
+            gate.take(found, found.t_ns)
+        sent.append((gate.sending, gate.why_not))
+    assert sent == [(False, "camera mount is not known"), (True, "")]
+
+
+def test_a_scale_that_is_uncertain_makes_the_velocity_so() -> None:
+    odometry = unaided()
+    for k in range(10):
+        certain = give(odometry, track(k))
+    doubted = replace(PLACED, sigma_scale=0.04)
+    uncertain = odometry.step(track(10), 0, doubted, VELOCITY, born=KNOWN)
+    by_scale_m_s = np.sqrt(uncertain.sigma_velocity_m_s**2 - certain.sigma_velocity_m_s**2)
+    assert by_scale_m_s == pytest.approx(0.7 * np.sqrt(0.04**2 - 0.01**2) * 2 * SPEED, rel=0.02)
 
 
 def test_map_correction_is_slew_limited() -> None:
@@ -90,11 +119,11 @@ def test_heading_sigma_includes_the_pending_correction() -> None:
     turned = Georeference(
         Similarity(2.0, yaw_rotation(north_rad), np.zeros(3)), 0.01, 0.002, "GPS", 90, 0.3
     )
-    after = odometry.step(track(10), 0, turned, VELOCITY)
+    after = odometry.step(track(10), 0, turned, VELOCITY, born=KNOWN)
     assert after.world_from_body is not None
     assert abs(np.arctan2(*after.world_from_body.rotation[[1, 0], [0, 0]])) < np.radians(0.1)
     assert after.sigma_yaw_rad == pytest.approx(north_rad, rel=0.05)
-    later = [odometry.step(track(k), 0, turned, VELOCITY) for k in range(11, 200)][-1]
+    later = [odometry.step(track(k), 0, turned, VELOCITY, born=KNOWN) for k in range(11, 200)][-1]
     assert later.sigma_yaw_rad == pytest.approx(
         np.linalg.norm([0.002, noise_rad, floor_rad]), rel=0.01
     )
@@ -179,7 +208,7 @@ def test_accelerometers_carry_the_pose_on(pictures: bool) -> None:
             continue
         odometry.begin(k * 100_000_000, attitude)
         seen = Track(k, k * 100_000_000, TrackState.LOST) if blind else track(k)
-        found.append(odometry.step(seen, 0, PLACED, VELOCITY))
+        found.append(give(odometry, seen))
     places = np.array([north(each) for each in found])
     assert np.abs(np.diff(places) - 0.2).max() < 0.02
     assert {each.state for each in found[100:120]} == {TrackState.DEAD_RECKONING}
@@ -218,7 +247,7 @@ def test_another_map_goes_on_from_where_accelerometers_had_its_first_view(
             half = replace(placed, world_from_map=Similarity(scale, np.eye(3), np.zeros(3)))
             known = half if k >= 140 else None
         view = MapView(12_000_000_000, first) if map_number else None
-        found.append(odometry.step(seen, map_number, known, VELOCITY, view))
+        found.append(odometry.step(seen, map_number, known, VELOCITY, view, KNOWN))
     places = np.array([north(each) for each in found])
     steps = np.diff(places) - 0.2
     assert np.abs(steps[:139]).max() < 0.05

@@ -24,7 +24,9 @@ from companion.geometry.transforms import (
 from companion.messages import Georeference, Odometry, Track, TrackState
 from companion.telemetry import AttitudeSample, ImuSample
 
-CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, body_from_camera=Pose.identity())
+KNOWN = np.zeros(200, np.int64)
+"""Keyframes at which the points of a frame were made: all of them before."""
 PLACED = Georeference(
     Similarity(1.0, np.eye(3), np.zeros(3)), 0.01, 0.01, "IMU", 0, 0.0, has_origin=False
 )
@@ -67,7 +69,7 @@ class Vehicle:
                 sigma_rotation_rad=0.001,
             )  # fmt: skip
         return self.odometry.step(
-            track, segment, georeference, ImageVelocity(np.zeros(3), 0.2), first
+            track, segment, georeference, ImageVelocity(np.zeros(3), 0.2), first, KNOWN
         )
 
     def frames(self, n: int, at_m: Array | None = None, *, standing: bool = False) -> Odometry:
