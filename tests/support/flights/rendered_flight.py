@@ -110,7 +110,7 @@ class Terrain:
             place = (north, east, north + size, east + size)
             self._levels.append((height, place, self._levels[k % 5][2] if k > 4 else pattern(rng)))
         self._levels[1:] = sorted(self._levels[1:], key=lambda level: -level[0])
-        self._rays: dict[int, Bytes] = {}
+        self._rays: dict[Camera, np.ndarray] = {}
 
     def add_roof(self, height_m: float, at: tuple[float, float], size_m: float, look: int) -> None:
         """Put a square roof with its corner at (north, east) there; `look` is a seed."""
@@ -150,12 +150,12 @@ class Terrain:
         return whole
 
     def _rays_of(self, camera: Camera) -> np.ndarray:
-        if id(camera) not in self._rays:
+        if camera not in self._rays:
             u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
             flat = camera.normalise(np.stack([u, v], -1).reshape(-1, 2))
             rays = np.c_[flat, np.ones(len(flat))].reshape(camera.height, camera.width, 3)
-            self._rays[id(camera)] = rays.astype(np.float32)
-        return self._rays[id(camera)]
+            self._rays[camera] = rays.astype(np.float32)
+        return self._rays[camera]
 
 
 @dataclass(slots=True, eq=False)

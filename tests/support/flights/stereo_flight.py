@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -46,8 +47,9 @@ def with_baseline(stretched: float) -> Camera:
     return replace(SECOND, body_from_camera=CAMERA_DOWN @ apart)
 
 
+@functools.cache
 def ground() -> Terrain:
-    """The ground that it flies over."""
+    """The ground that it flies over: its leaves take seconds to draw."""
     return Terrain(5, pattern=leaves)
 
 
