@@ -32,6 +32,8 @@ prefix=$root/opt/companion
 "$prefix/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile .
 "$prefix/bin/python" -m pip uninstall --quiet --yes pip setuptools
 rm -f "$prefix"/lib/python*/site-packages/companion-*.dist-info/direct_url.json
+# So that no start compiles them; for any processor of this architecture.
+"$prefix/bin/python" -m companion.slam.compiled.ship >/dev/null
 # Where it was made is not where it will be.
 grep -rlI "$prefix" "$prefix/bin" "$prefix/pyvenv.cfg" | xargs sed -i "s|$prefix|/opt/companion|g"
 find "$prefix" -name __pycache__ -prune -exec rm -rf {} +

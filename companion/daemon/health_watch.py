@@ -39,7 +39,7 @@ STUCK_NS = 3_000_000_000
 BUSY_STUCK_NS, BUSY_CORES = 10_000_000_000, 0.02
 """The same where it uses the processor, by so many cores at least: the computer is overloaded."""
 START_S = 120.0
-"""Longest start of localisation; the first of all compiles its loops."""
+"""Longest start of localisation; the first of all may compile its loops."""
 PATIENCE_NS = 20_000_000_000
 """Time with frames but no track, after a restart of localisation, before the daemon gives up."""
 NO_SIGN_S = 10.0

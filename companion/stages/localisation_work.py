@@ -33,7 +33,7 @@ from companion.products.site_map_file import (
 )
 from companion.runtime.stage_protocol import Finish, KeepMap, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
-from companion.slam.compiled.compiling import cache_errors
+from companion.slam.compiled.compiling import cache_errors, shipped
 from companion.stages.map_keeper import Kept, MapKeeper
 from companion.timing.clock import since_boot_ns
 from drivers.system.file_pages import give_back_library_pages
@@ -49,6 +49,12 @@ NOT_KEPT = "the map cannot be kept for a restart in flight"
 class _Localisation(Work):
     def __init__(self, setup: Setup) -> None:
         super().__init__()
+        if shipped.why_unfit:
+            print(
+                f"companion: the package's compiled loops are not used ({shipped.why_unfit}): "
+                "compiled here instead, and kept",
+                file=sys.stderr,
+            )
         if cache_errors:
             print(
                 f"companion: {len(cache_errors)} compiled loops cannot be kept "

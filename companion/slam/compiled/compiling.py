@@ -1,16 +1,23 @@
-"""Compilation of the kernels by numba, and their cache."""
+"""Compilation of the kernels by numba, and what spares it: code of the package, numba's cache."""
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, TypeVar, cast
 
+import llvmlite
 import numba
 import numpy as np
 from numba import types
+from numba.core.caching import NullCache
+from numba.core.compiler import CompileResult
+from numba.core.runtime.nrt import rtsys
 from numba.np.numpy_support import as_dtype
 from numpy.typing import NDArray
+
+from companion.slam.compiled.shipped_code import FOLDER, ShippedCode, circumstances
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -32,6 +39,12 @@ images, patches = given(types.uint8, 2), given(types.uint8, 3)
 
 cache_errors: list[str] = []
 """Reasons why kernels could not be cached or loaded; each start then compiles them."""
+HERE = circumstances(numba.__version__, llvmlite.__version__)
+"""What machine code depends on, besides the processor."""
+shipped = ShippedCode(FOLDER, HERE)
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+_loops: dict[str, Any] = {}
+"""What numba has made of each loop, by `module.name`."""
 
 
 def compiled(*arguments: Any) -> Callable[[Loop], Loop]:
@@ -42,11 +55,10 @@ def compiled(*arguments: Any) -> Callable[[Loop], Loop]:
     kinds = [as_dtype(a.dtype) if isinstance(a, types.Array) else None for a in arguments]
 
     def compile_loop(loop: Loop) -> Loop:
-        try:
-            done: Any = numba.njit(arguments, nogil=True, cache=True, error_model="numpy")(loop)
-        except Exception as error:  # disk full or corrupt file; other errors recur below
-            cache_errors.append(f"{loop.__name__}: {error}")
-            done = numba.njit(arguments, nogil=True, error_model="numpy")(loop)
+        name = f"{loop.__module__.rpartition('.')[2]}.{loop.__name__}"
+        code = shipped.of(name)
+        done = _compiled(loop, arguments) if code is None else _loaded(loop, arguments, code)
+        _loops[name] = done
 
         @wraps(loop)
         def call(*values: Any) -> Any:
@@ -64,5 +76,46 @@ def compiled(*arguments: Any) -> Callable[[Loop], Loop]:
 
 def part(loop: Loop) -> Loop:
     """Compile a function that only kernels of the same file call."""
-    done: Any = numba.njit(nogil=True, error_model="numpy")(loop)
+    done: Any = numba.njit(**OPTIONS)(loop)
     return cast(Loop, done)
+
+
+def code_of_loops() -> dict[str, bytes]:
+    """Machine code of all loops that were imported, by `module.name`."""
+    return {
+        name: pickle.dumps([done.overloads[kinds]._reduce() for kinds in done.overloads])
+        for name, done in _loops.items()
+    }
+
+
+def _compiled(loop: Loop, arguments: tuple[Any, ...]) -> Any:
+    try:
+        return numba.njit(arguments, cache=True, **OPTIONS)(loop)
+    except Exception as error:  # disk full or corrupt file; other errors recur below
+        cache_errors.append(f"{loop.__name__}: {error}")
+        return numba.njit(arguments, **OPTIONS)(loop)
+
+
+class _Kept(NullCache):
+    """A cache of the one loop whose code is given."""
+
+    def __init__(self, code: bytes) -> None:
+        self._code = code
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        rtsys.initialize(target_context)  # of all that compiling needs it alone is used by code
+        ((*parts,),) = pickle.loads(self._code)
+        compiled: Any = CompileResult
+        return compiled._rebuild(target_context, *parts)
+
+
+def _loaded(loop: Loop, arguments: tuple[Any, ...], code: bytes) -> Any:
+    try:
+        done: Any = numba.njit(**OPTIONS)(loop)
+        done._cache = _Kept(code)
+        done.compile(arguments)
+        done.disable_compile()
+    except Exception as error:  # a damaged file
+        shipped.why_unfit = f"{loop.__name__}: {type(error).__name__}: {error}"
+        return _compiled(loop, arguments)
+    return done
