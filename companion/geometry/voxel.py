@@ -47,7 +47,29 @@ def voxel_downsample(
     cell -= cell.min(0)
     extent = cell.max(0) + 1
     key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-    order = np.lexsort((np.arange(len(key)), -confidence, key))
-    first = np.r_[True, np.diff(key[order]) != 0]
-    out: NDArray[np.int64] = np.sort(order[first])
+    key, order = _sorted_keys(key)
+    begins = np.flatnonzero(_is_first(key))
+    in_order = confidence[order]
+    most = np.maximum.reduceat(in_order, begins)
+    best = np.flatnonzero(in_order == np.repeat(most, np.diff(begins, append=len(key))))
+    out: NDArray[np.int64] = np.sort(order[best[_is_first(key[best])]])
+    return out
+
+
+def _sorted_keys(key: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Keys (N,), none negative, in ascending order, and their indices; equal ones in order.
+
+    Where both fit into one number, that is sorted: in half the time of sorting indices.
+    """
+    n = len(key)
+    if int(key.max()) < 2**63 // n - 1:
+        both = np.sort(key * n + np.arange(n))
+        return both // n, both % n
+    order = np.argsort(key, kind="stable")
+    return key[order], order
+
+
+def _is_first(key: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """True for each first of equal neighbours."""
+    out: NDArray[np.bool_] = np.r_[True, key[1:] != key[:-1]]
     return out

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime, timezone
 from typing import Any
 
@@ -40,10 +41,14 @@ def report_page(
     """HTML with all styles and pictures embedded; `numbers` are those of report.json."""
     segments = path_segments(poses)
     flown = [places for _, places in segments]
-    scene = None
-    if len(cloud):
-        view = oblique_heading_rad(cloud, flown), OBLIQUE_DOWN_RAD
-        scene = cloud_scene(cloud, flown, _keyframes(result), view, result.unit, facts.origin)
+    # numpy, which draws the views, holds up no other thread: plots and page are made meanwhile
+    with ThreadPoolExecutor(1, "views") as beside:
+        views = beside.submit(cloud_views, cloud, flown)
+        drawn = _plots(result, facts, segments, numbers["duration_s"])
+        scene = None
+        if len(cloud):
+            view = oblique_heading_rad(cloud, flown), OBLIQUE_DOWN_RAD
+            scene = cloud_scene(cloud, flown, _keyframes(result), view, result.unit, facts.origin)
     return rendered(
         "report.html.j2",
         distance,
@@ -51,11 +56,11 @@ def report_page(
         number,
         n=numbers,
         when=when(result.first_t_ns),
-        plots=_plots(result, facts, segments, numbers["duration_s"]),
+        plots=drawn,
         autopilot=_autopilot_name(result),
         belief=belief_in_words(facts.believed),
         scene=scene,
-        views=[_view(view) for view in cloud_views(cloud, flown)],
+        views=[_view(view) for view in views.result()],
         depths=_depths(result),
         stages=plots.slowest_first({**numbers["stages"], **kernel_stages(result)}),
         config=json.dumps(numbers["config"], indent=2, ensure_ascii=False),

@@ -8,6 +8,7 @@ from pathlib import Path
 from companion.config import ViewerConfig
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
+from companion.runtime.message_size import size_bytes
 from companion.streaming.frame_jpeg import picture_of
 from companion.streaming.items import FlightItem, ImageItem, Item
 from companion.streaming.scene_encoder import SceneEncoder, Watched
@@ -72,5 +73,5 @@ class FileViewer:
                 width, quality = self._config.image_width, self._config.jpeg_quality
                 item = picture_of(item, width, quality)
             drawing.draw(item)
-            if self._files.is_full():
+            if self._files.is_full(size_bytes(item)):
                 drawing.go_on_in(self._files.next())

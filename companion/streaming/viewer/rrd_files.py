@@ -20,7 +20,9 @@ APPLICATION = "companion-2"
 """Viewers store a layout by this name: a new layout has a new number."""
 N_FILES = 4
 """Number of files that share the size limit."""
-LOOK_EVERY = 16
+LOOK_SHARE, LOOK_BYTES = 1 / 32, 8 << 20
+"""Part of a file, and so many bytes at most, that are drawn until its size and the disk are looked
+at: that waits for the disk."""
 FLUSH_S = 20.0
 """A disk that takes longer for some megabytes takes nothing more."""
 LEFT_FREE_BYTES = 64 << 20
@@ -41,17 +43,19 @@ class RrdFiles:
         self._id = str(uuid.uuid4())
         self._paths: list[Path] = []
         self._n_begun = 0
-        self._n_looked = 0
+        self._n_drawn = 0
+        """Bytes, of the messages, since the size of the file was looked at."""
         self.recording = self._begin()
 
-    def is_full(self) -> bool:
-        """True if the next file is due; the disk is checked on every LOOK_EVERY-th call only.
+    def is_full(self, n_bytes: int) -> bool:
+        """True if the next file is due, after so many more bytes; the disk is seldom checked.
 
         OSError where the recording cannot be written, or would take the room of the results.
         """
-        self._n_looked += 1
-        if self._n_looked % LOOK_EVERY:
+        self._n_drawn += n_bytes
+        if self._n_drawn < min(LOOK_SHARE * self._each or LOOK_BYTES, LOOK_BYTES):
             return False
+        self._n_drawn = 0
         if shutil.disk_usage(self._first.parent).free < LEFT_FREE_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._paths[-1]))
         if not self._each:

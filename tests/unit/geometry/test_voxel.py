@@ -48,3 +48,17 @@ def test_distinct_cells_are_those_of_unique_rows(apart: int) -> None:
     expected, index = np.unique(cells, axis=0, return_inverse=True)
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(which, index.ravel())
+
+
+@pytest.mark.parametrize("side", [1.0, 1e-15])
+def test_best_of_each_voxel_is_kept_the_first_of_ties(side: float) -> None:
+    generator = np.random.default_rng(1)
+    points = generator.integers(0, 4, (400, 3)).astype(np.float64)
+    confidence = generator.integers(0, 3, 400).astype(np.float32)
+    points += side / 3
+    kept = {}
+    for i, cell in enumerate(map(tuple, points.tolist())):
+        if cell not in kept or confidence[i] > confidence[kept[cell]]:
+            kept[cell] = i
+    found = voxel_downsample(points, confidence, side, np.zeros(3))
+    assert found.tolist() == sorted(kept.values())
