@@ -50,6 +50,11 @@ class ForkServer:
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, pass_fds=(theirs.fileno(),),
             )  # fmt: skip
 
+    def prepare(self, name: str) -> None:
+        """Have a process import what a stage needs, and wait until that stage is started."""
+        with contextlib.suppress(OSError):  # a server that is gone is told of when a stage starts
+            self._control.send(name.encode())
+
     def start(self, name: str, descriptor: int) -> Child:
         """Start the process of a stage, with the descriptor of its socket."""
         answers, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -23,6 +23,7 @@ from companion.runtime.fork_server import ANSWER, NAME_BYTES
 from companion.runtime.parcel import allow_descriptors
 from companion.runtime.stage_child import run
 from companion.runtime.stage_start import ignore_signals
+from companion.runtime.stage_work import module_of
 from companion.timing.clock import monotonic_s
 
 ORPHANS_S = 60.0
@@ -37,6 +38,8 @@ class _Server:
         self._poll.register(control, select.POLLIN)
         self._children: dict[int, tuple[int, socket.socket]] = {}
         """By handle: process id, and where its status goes."""
+        self._prepared: dict[str, tuple[int, socket.socket]] = {}
+        """By stage: a process that has imported what it needs, and what its socket is sent by."""
         self._gone_s: float | None = None
         """Time when the daemon went."""
 
@@ -58,13 +61,30 @@ class _Server:
             self._poll.unregister(self._control)
             self._gone_s = monotonic_s()
             return
+        if not descriptors:
+            self._prepare(packet.decode())
+            return
         answers, descriptor = descriptors
         self._start(socket.socket(fileno=answers), packet.decode(), descriptor)
         os.close(descriptor)
 
+    def _prepare(self, name: str) -> None:
+        own, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            try:
+                pid = os.fork()
+            except OSError:  # which is told of when the stage is to start
+                own.close()
+                return
+            if pid == 0:
+                own.close()
+                self._become(theirs, name, None)
+        self._prepared[name] = pid, own
+
     def _start(self, answers: socket.socket, name: str, descriptor: int) -> None:
+        pid = self._handed_over(name, descriptor)
         try:
-            pid = os.fork()
+            pid = pid or os.fork()
         except OSError as error:  # no memory, or too many processes: the daemon tries again
             print(f"companion: no process for {name}: {error}", file=sys.stderr)
             answers.close()
@@ -77,16 +97,40 @@ class _Server:
         if not _send(answers, pid, [handle]):
             os.kill(pid, SIGKILL)  # nobody waits for it any more
 
-    def _become(self, answers: socket.socket, name: str, descriptor: int) -> NoReturn:
-        """Be a stage from here on: nothing of the server's stays open."""
+    def _handed_over(self, name: str, descriptor: int) -> int | None:
+        """Id of the process that was prepared for a stage and now has its socket; None without."""
+        if name not in self._prepared:
+            return None
+        pid, to = self._prepared.pop(name)
+        with to:
+            try:
+                socket.send_fds(to, [b"start"], [descriptor])
+            except OSError:  # it has died, whyever
+                os.waitpid(pid, 0)
+                return None
+        return pid
+
+    def _become(self, asked: socket.socket, name: str, descriptor: int | None) -> NoReturn:
+        """Be a stage from here on: nothing of the server's stays open.
+
+        Without a descriptor wait for that, with all imported; `asked` is where it comes.
+        """
         status = 1
         try:
+            for _, other in self._prepared.values():
+                other.close()
             for handle, (_, other) in self._children.items():
                 os.close(handle)
                 other.close()
-            answers.close()
             self._control.close()
             gc.enable()
+            if descriptor is None:
+                module_of(name)
+                _packet, given, _flags, _address = socket.recv_fds(asked, NAME_BYTES, 1)
+                if not given:  # the daemon has no use for it
+                    os._exit(0)
+                (descriptor,) = given
+            asked.close()
             status = run(name, descriptor)
         except BaseException:
             sys.excepthook(*sys.exc_info())

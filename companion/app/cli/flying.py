@@ -37,6 +37,7 @@ def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.runtime.fork_server import ForkServer
 
     with ForkServer(copy=True) as server:  # before there are threads and what only the daemon needs
+        server.prepare("localisation")  # whose imports take longest, while the daemon makes its own
         from companion.daemon.daemon import run
         from companion.daemon.page_child import SettingsSource
 

@@ -75,6 +75,41 @@ def test_a_stage_is_a_child_of_the_server_under_its_name_and_finishes(server: Fo
     assert viewers.stage.finished is not None and not viewers.stage.alive
 
 
+def test_a_prepared_stage_is_the_process_that_waited(server: ForkServer) -> None:
+    server.prepare("viewers")
+    process = psutil.Process(server.pid)
+    until(lambda: len(process.children()) == 1)
+    (waiting,) = process.children()
+    first, second = Viewers(server), Viewers(server)
+    assert first.begin() == waiting and waiting.name() == "viewers"
+    assert second.begin() != waiting
+    waiting.kill()
+    assert first.end() == "killed by SIGKILL"
+    second.stage.ask_to_finish(Finish(hurry=True))
+    assert second.stage.wait(PATIENCE_S) and second.end() == ""
+
+
+def test_a_prepared_stage_that_has_died_is_started_anew(server: ForkServer) -> None:
+    server.prepare("viewers")
+    process = psutil.Process(server.pid)
+    until(lambda: len(process.children()) == 1)
+    (waiting,) = process.children()
+    waiting.kill()
+    until(lambda: waiting.status() == psutil.STATUS_ZOMBIE)
+    viewers = Viewers(server)
+    assert viewers.begin() != waiting
+    viewers.stage.kill()
+
+
+def test_a_prepared_stage_that_nobody_starts_ends_with_the_server() -> None:
+    with ForkServer() as server:
+        server.prepare("viewers")
+        process = psutil.Process(server.pid)
+        until(lambda: len(process.children()) == 1)
+        (waiting,) = process.children()
+    until(lambda: not waiting.is_running() or waiting.status() == psutil.STATUS_ZOMBIE)
+
+
 @pytest.mark.parametrize(
     ("number", "why"),
     [(signal.SIGKILL, "killed by SIGKILL"), (signal.SIGSEGV, "killed by SIGSEGV"),
