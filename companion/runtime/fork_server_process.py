@@ -21,9 +21,8 @@ from typing import NoReturn
 
 from companion.runtime.fork_server import ANSWER, NAME_BYTES
 from companion.runtime.parcel import allow_descriptors
-from companion.runtime.stage_child import run
+from companion.runtime.stage_child import imported, run
 from companion.runtime.stage_start import ignore_signals
-from companion.runtime.stage_work import module_of
 from companion.timing.clock import monotonic_s
 
 ORPHANS_S = 60.0
@@ -123,9 +122,8 @@ class _Server:
                 os.close(handle)
                 other.close()
             self._control.close()
-            gc.enable()
             if descriptor is None:
-                module_of(name)
+                imported(name)
                 _packet, given, _flags, _address = socket.recv_fds(asked, NAME_BYTES, 1)
                 if not given:  # the daemon has no use for it
                     os._exit(0)

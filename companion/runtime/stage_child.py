@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import resource
 import socket
@@ -40,6 +41,7 @@ from companion.runtime.stage_protocol import (  # noqa: E402
 )
 from companion.runtime.stage_work import Work, WorkModule, module_of  # noqa: E402
 from companion.runtime.stages import Stage, drop_policy, stage_named  # noqa: E402
+from companion.runtime.uncollected import uncollected  # noqa: E402
 from companion.timing.clock import monotonic_s, wait_s  # noqa: E402
 
 IN_BYTES = 64 << 20
@@ -67,7 +69,7 @@ def run(name: str, descriptor: int) -> int:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     sys.setswitchinterval(SWITCH_S)
     daemon = socket.socket(fileno=descriptor)
-    module = module_of(stage.name)  # which takes a second, and may be long before there is a flight
+    module = imported(stage.name)  # which takes a second, and may be long before there is a flight
     try:
         (first,) = Parcel.receive(daemon)  # it comes by itself
         setup: Setup = first.open()
@@ -80,6 +82,14 @@ def run(name: str, descriptor: int) -> int:
         send(Failed(str(error), isinstance(error, InputError)))
         return 1
     return 0
+
+
+def imported(name: str) -> WorkModule:
+    """Module of a stage, with all that it needs."""
+    with uncollected():
+        module = module_of(name)
+    gc.enable()  # which the fork server has not
+    return module
 
 
 def _serve(

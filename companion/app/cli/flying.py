@@ -13,6 +13,7 @@ from companion.app.stopping import StopSignals
 from companion.config import Config
 from companion.config_file import load_config, to_toml
 from companion.errors import InputError
+from companion.runtime.uncollected import uncollected
 
 
 def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -33,13 +34,15 @@ def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
         signals.defer()
         return run_depth_node(config, lambda: signals.received is not None)
-    import companion.daemon.shared_imports  # noqa: F401
+    with uncollected():
+        import companion.daemon.shared_imports  # noqa: F401
     from companion.runtime.fork_server import ForkServer
 
     with ForkServer(copy=True) as server:  # before there are threads and what only the daemon needs
         server.prepare("localisation")  # whose imports take longest, while the daemon makes its own
-        from companion.daemon.daemon import run
-        from companion.daemon.page_child import SettingsSource
+        with uncollected():
+            from companion.daemon.daemon import run
+            from companion.daemon.page_child import SettingsSource
 
         return run(load, server.start, SettingsSource(arguments.config, tuple(arguments.set)))
 

@@ -25,6 +25,7 @@ from companion.app.stopping import StopSignals
 from companion.config import Config, MapConfig
 from companion.config_file import load_config
 from companion.errors import InputError
+from companion.runtime.uncollected import uncollected
 
 
 def _with_telemetry(arguments: argparse.Namespace) -> Config:
@@ -67,12 +68,13 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         replay_as_flown(arguments.flight, arguments.out, config, progress, print)
         signals.take()
         return 0
-    from companion.app.replay.replay_command import RecordedInput, replay
-    from companion.telemetry import belief_in_words
+    with uncollected():
+        from companion.app.replay.replay_command import RecordedInput, replay
+        from companion.telemetry import belief_in_words
 
-    if arguments.paced:
-        from companion.app.replay.paced_replay import replay_paced as replay
-    given = RecordedInput(arguments.flight, config, arguments.start, arguments.stop)
+        if arguments.paced:
+            from companion.app.replay.paced_replay import replay_paced as replay
+        given = RecordedInput(arguments.flight, config, arguments.start, arguments.stop)
     for remark in given.log.remarks:
         print(f"telemetry: {remark}")
     belief = belief_in_words(config.telemetry.use)

@@ -11,7 +11,7 @@ import llvmlite
 import numba
 import numpy as np
 from numba import types
-from numba.core.caching import NullCache
+from numba.core.caching import FunctionCache, NullCache
 from numba.core.compiler import CompileResult
 from numba.core.runtime.nrt import rtsys
 from numba.np.numpy_support import as_dtype
@@ -88,34 +88,53 @@ def code_of_loops() -> dict[str, bytes]:
     }
 
 
-def _compiled(loop: Loop, arguments: tuple[Any, ...]) -> Any:
-    try:
-        return numba.njit(arguments, cache=True, **OPTIONS)(loop)
-    except Exception as error:  # disk full or corrupt file; other errors recur below
-        cache_errors.append(f"{loop.__name__}: {error}")
-        return numba.njit(arguments, **OPTIONS)(loop)
+class _NumbaCache(FunctionCache):
+    """Numba's cache; loads without what compiling alone needs, which takes a tenth of a second."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        rtsys.initialize(target_context)
+        cache: Any = super()
+        with cache._guard_against_spurious_io_errors():
+            found = cache._load_overload(sig, target_context)
+        if found is None:
+            target_context.refresh()
+        return found
 
 
-class _Kept(NullCache):
+class _Given(NullCache):
     """A cache of the one loop whose code is given."""
 
     def __init__(self, code: bytes) -> None:
         self._code = code
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        rtsys.initialize(target_context)  # of all that compiling needs it alone is used by code
+        rtsys.initialize(target_context)
         ((*parts,),) = pickle.loads(self._code)
         compiled: Any = CompileResult
         return compiled._rebuild(target_context, *parts)
 
 
+def _through(cache: Any, loop: Loop, arguments: tuple[Any, ...]) -> Any:
+    """The loop from a cache, or compiled and put there."""
+    done: Any = numba.njit(**OPTIONS)(loop)
+    done._cache = cache
+    done.compile(arguments)
+    done.disable_compile()
+    return done
+
+
+def _compiled(loop: Loop, arguments: tuple[Any, ...]) -> Any:
+    try:
+        cache: Any = _NumbaCache
+        return _through(cache(loop), loop, arguments)
+    except Exception as error:  # disk full or corrupt file; other errors recur below
+        cache_errors.append(f"{loop.__name__}: {error}")
+        return numba.njit(arguments, **OPTIONS)(loop)
+
+
 def _loaded(loop: Loop, arguments: tuple[Any, ...], code: bytes) -> Any:
     try:
-        done: Any = numba.njit(**OPTIONS)(loop)
-        done._cache = _Kept(code)
-        done.compile(arguments)
-        done.disable_compile()
+        return _through(_Given(code), loop, arguments)
     except Exception as error:  # a damaged file
         shipped.why_unfit = f"{loop.__name__}: {type(error).__name__}: {error}"
         return _compiled(loop, arguments)
-    return done
