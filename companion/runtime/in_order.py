@@ -9,6 +9,7 @@ the cloud so far stay.
 
 from __future__ import annotations
 
+import os
 import queue
 import threading
 from collections import deque
@@ -26,6 +27,8 @@ DEPTH_QUEUE, DEPTH_QUEUE_BYTES = 64, 128 << 20
 """Capacity of the queue to depth, in messages and bytes."""
 DEPTH_FAILED = "the dense map ends here: the depth stage has failed"
 APART = "depth"
+APART_NICE = 10
+"""Of its thread: beside nice 0 it gets a tenth of a core that both want, and all that is left."""
 FRAMES_AHEAD = 4
 """A keyframe takes as long as the features of some frames."""
 
@@ -44,10 +47,18 @@ class InOrder:
         self._watch = watch
         self._stages = list(stages)
         self.works: dict[str, Work] = {}
+
+        def tell(told: Any) -> None:
+            if isinstance(told, Remark):
+                say(told.text)
+
+        self._depth: _Apart | None = None
         for stage in self._stages:
             self.works[stage.name] = work = module_of(stage.name).work(setup)
-            work.begin(lambda told: say(told.text) if isinstance(told, Remark) else None)
-        self._depth = _Apart(self.works[APART]) if APART in self.works else None
+            if stage.name == APART:
+                self._depth = _Apart(work, tell)
+            else:
+                work.begin(tell)
         self._fault_reported = False
         self._t_ns = 0
 
@@ -139,22 +150,27 @@ class InOrder:
 
 
 class _Apart:
-    """A stage in its own thread; its results wait until they are collected.
+    """A stage in its own thread, which begins it; its results wait until they are collected.
 
-    A stage that raises ends: later messages are ignored, earlier results can still be collected,
-    and `fault` is the exception.
+    The path waits for nobody but for whom it needs: this thread, and those that drivers start from
+    it, run at a lower priority. A stage that raises ends: later messages are ignored, earlier
+    results can still be collected, and `fault` is the exception.
     """
 
-    def __init__(self, work: Work) -> None:
-        self._work = work
+    def __init__(self, work: Work, tell: Callable[[Any], None]) -> None:
+        self._work, self._tell = work, tell
         self._inbox: queue.Queue[Message | None] = queue.Queue(DEPTH_QUEUE)
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._n_bytes = 0
         self._taken = threading.Condition()
         self._is_open = True
+        self._has_begun = threading.Event()
         self.fault: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="depth", daemon=True)
         self._thread.start()
+        self._has_begun.wait()
+        if self.fault is not None:
+            raise self.fault
 
     def put(self, message: Message) -> None:
         """Pass a message; waits for room. Ignored once it is closed."""
@@ -185,6 +201,14 @@ class _Apart:
 
     def _run(self) -> None:
         is_open = True
+        os.nice(APART_NICE)
+        try:
+            self._work.begin(self._tell)
+        except BaseException as fault:
+            self.fault = fault
+            return
+        finally:
+            self._has_begun.set()
         try:
             while (message := self._take()) is not None:
                 for out in self._work.step(message):

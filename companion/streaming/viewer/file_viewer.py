@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from companion.streaming.viewer.inbox import Inbox
 from companion.streaming.viewer.rrd_files import RrdFiles
 
 CAPACITY_BYTES = 64 << 20
+NICE = 5
+"""Of its thread, which in Linux has a priority of its own: what is shown waits for the path."""
 
 
 class FileViewer:
@@ -56,6 +59,7 @@ class FileViewer:
                 raise self._fault
 
     def _work(self) -> None:
+        os.nice(NICE)
         try:
             colours = Colours(self._config.colours)
             drawing = Drawing(self._files.recording, live=False, colours=colours)
