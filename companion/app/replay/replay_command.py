@@ -142,7 +142,7 @@ def replay(
             live.take(message)
 
     with ExitStack() as stack:
-        stages = InOrder(map(stage_named, names), setup, watch, notify)
+        stages = InOrder(map(stage_named, names), setup, watch, notify, forked=("depth", "results"))
         depth = stages.works.get("depth")
         began_s = monotonic_s()
         completed = False
