@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
@@ -30,6 +30,7 @@ class _Results(Work):
         if setup.folder is None:
             raise StageError("the results need a folder")
         self._folder, self._voxel_m = setup.folder, setup.config.cloud.voxel_m
+        self._is_live = setup.is_live
         self._open = ExitStack()
         self._folder.mkdir(parents=True, exist_ok=True)
         self._result = FlightResult(self._folder, setup.config.cloud.memory_mb)
@@ -45,6 +46,11 @@ class _Results(Work):
         )
         if setup.is_live:  # in a process of its own
             give_back_library_pages()
+
+    def begin(self, tell: Callable[[Any], None]) -> None:
+        """Load what makes the report, unless in flight, where it would take memory for long."""
+        if not self._is_live:
+            import companion.products.report.write_results  # noqa: F401
 
     def step(self, message: Any) -> Iterable[Message | Snapshot | ResultsWritten]:
         if isinstance(message, WriteResults):

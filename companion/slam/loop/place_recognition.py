@@ -9,10 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array
 from companion.messages import Bytes
+from companion.slam.compiled.word_matching import (
+    Words,
+    equal_spans,
+    with_weights,
+    words_of_bits,
+)
 from companion.slam.features.orb_features import Ints
 
 N_TABLES = 8
@@ -20,16 +25,13 @@ N_BITS = 18
 BLOCK = 32
 """Keyframes whose words are sorted together."""
 
-Words = NDArray[np.uint32]
 _CHOSEN = np.random.default_rng(20).permutation(256)[: N_TABLES * N_BITS].reshape(N_TABLES, N_BITS)
-_WEIGHTS = 1 << np.arange(N_BITS, dtype=np.int64)
 
 
 def words_of(descriptors: Bytes) -> Words:
     """The distinct words (M,) of descriptors (N, 32), sorted."""
-    bits = np.unpackbits(descriptors, axis=1)
-    words = bits[:, _CHOSEN] @ _WEIGHTS + (np.arange(N_TABLES) << N_BITS)
-    return np.unique(words.astype(np.uint32))
+    words = np.sort(words_of_bits(descriptors, _CHOSEN))
+    return words[np.r_[True, words[1:] != words[:-1]]] if len(words) else words
 
 
 @dataclass(slots=True, eq=False)
@@ -109,21 +111,12 @@ class KeyframeDatabase:
 
     def _scores(self, words: Words) -> Array:
         """Similarity of each row to these words, by inverse document frequency."""
-        found, sizes = [], np.zeros(len(words), np.int64)
-        for block in self._blocks:
-            low = np.searchsorted(block.words, words, "left")
-            high = np.searchsorted(block.words, words, "right")
-            count = high - low
-            sizes += count
-            hit = np.flatnonzero(count)
-            # rows of all equal words, concatenated
-            starts = np.repeat(low[hit] - np.r_[0, np.cumsum(count[hit])[:-1]], count[hit])
-            found.append(
-                (np.repeat(hit, count[hit]), block.owners[starts + np.arange(len(starts))])
-            )
-        if not found:
-            return np.zeros(0)
+        spans = [equal_spans(block.words, words) for block in self._blocks]
+        sizes = np.zeros(len(words), np.int64)
+        for _, counts in spans:
+            sizes += counts
         rarity = np.log1p(len(self) / (1.0 + sizes))
-        which = np.concatenate([f[0] for f in found])
-        owners = np.concatenate([f[1] for f in found])
-        return np.asarray(np.bincount(owners, rarity[which], len(self._keys)), np.float64)
+        scores = np.zeros(len(self._keys))
+        for block, (begins, counts) in zip(self._blocks, spans, strict=True):
+            scores = with_weights(scores, block.owners, begins, counts, rarity)
+        return scores

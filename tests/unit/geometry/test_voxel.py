@@ -56,7 +56,7 @@ def test_best_of_each_voxel_is_kept_the_first_of_ties(side: float) -> None:
     points = generator.integers(0, 4, (400, 3)).astype(np.float64)
     confidence = generator.integers(0, 3, 400).astype(np.float32)
     points += side / 3
-    kept = {}
+    kept: dict[tuple[float, ...], int] = {}
     for i, cell in enumerate(map(tuple, points.tolist())):
         if cell not in kept or confidence[i] > confidence[kept[cell]]:
             kept[cell] = i

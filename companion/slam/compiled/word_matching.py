@@ -1,0 +1,74 @@
+"""Words of binary descriptors, and who shares them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.geometry.transforms import Array
+from companion.messages import Bytes
+from companion.slam.compiled.compiling import (
+    Ints,
+    compiled,
+    given,
+    half_word,
+    images,
+    integer,
+    integers,
+    numbers,
+)
+
+Words = NDArray[np.uint32]
+words_given = given(half_word, 1)
+
+
+@compiled(images, given(integer, 2))
+def words_of_bits(descriptors: Bytes, bits: Ints) -> Words:
+    """Words (N * T,) of descriptors (N, 32): the bits (T, B) of each table, after its number."""
+    n, (n_tables, n_bits) = len(descriptors), bits.shape
+    out = np.empty(n * n_tables, np.uint32)
+    for i in range(n):
+        for table in range(n_tables):
+            word = table << n_bits
+            for k in range(n_bits):
+                bit = bits[table, k]
+                word |= ((descriptors[i, bit >> 3] >> (7 - (bit & 7))) & 1) << k
+            out[i * n_tables + table] = word
+    return out
+
+
+@compiled(words_given, words_given)
+def equal_spans(among: Words, words: Words) -> tuple[Ints, Ints]:
+    """Where each of `words` (M,) begins among others, and how often it is there; both sorted."""
+    n, m = len(among), len(words)
+    begins, counts = np.empty(m, np.int64), np.empty(m, np.int64)
+    at = 0
+    for i in range(m):
+        word = words[i]
+        step, low = 1, at  # words lie close to each other: the next is looked for from here on
+        while at < n and among[at] < word:
+            low = at + 1
+            at += step
+            step *= 2
+        high = min(at, n)
+        while low < high:
+            middle = (low + high) // 2
+            if among[middle] < word:
+                low = middle + 1
+            else:
+                high = middle
+        at = low
+        while at < n and among[at] == word:
+            at += 1
+        begins[i], counts[i] = low, at - low
+    return begins, counts
+
+
+@compiled(numbers, integers, integers, integers, numbers)
+def with_weights(scores: Array, owners: Ints, begins: Ints, counts: Ints, weights: Array) -> Array:
+    """Scores with the weight of each word added to each of its owners."""
+    out = scores.copy()
+    for i in range(len(begins)):
+        for j in range(begins[i], begins[i] + counts[i]):
+            out[owners[j]] += weights[i]
+    return out

@@ -1,0 +1,59 @@
+"""Words of descriptors and who shares them, against the same by numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from companion.messages import Bytes
+from companion.slam.compiled.word_matching import equal_spans, with_weights
+from companion.slam.loop.place_recognition import (
+    _CHOSEN,
+    N_BITS,
+    N_TABLES,
+    KeyframeDatabase,
+    words_of,
+)
+
+RANDOM = np.random.default_rng(3)
+
+
+def descriptors(n: int) -> Bytes:
+    return RANDOM.integers(0, 256, (n, 32), dtype=np.uint8)
+
+
+def test_a_word_is_its_table_and_some_bits() -> None:
+    given = descriptors(50)
+    bits = np.unpackbits(given, axis=1)[:, _CHOSEN]
+    wanted = bits @ (1 << np.arange(N_BITS)) + (np.arange(N_TABLES) << N_BITS)
+    assert words_of(given).tolist() == np.unique(wanted).tolist()
+    assert len(words_of(given[:0])) == 0
+
+
+def test_spans_are_those_of_a_search() -> None:
+    for n, m, most in ((0, 5, 9), (5, 0, 9), (1, 1, 2), (300, 40, 60), (300, 40, 3), (20, 400, 50)):
+        among = np.sort(RANDOM.integers(0, most, n).astype(np.uint32))
+        words = np.unique(RANDOM.integers(0, most, m).astype(np.uint32))
+        begins, counts = equal_spans(among, words)
+        assert begins.tolist() == np.searchsorted(among, words, "left").tolist()
+        assert (begins + counts).tolist() == np.searchsorted(among, words, "right").tolist()
+
+
+def test_weights_go_to_owners() -> None:
+    owners = np.array([0, 2, 2, 1])
+    scores = with_weights(
+        np.ones(3), owners, np.array([0, 3]), np.array([3, 1]), np.array([0.5, 2.0])
+    )
+    assert scores.tolist() == [1.5, 3.0, 2.0]
+
+
+def test_the_keyframe_that_shares_words_is_found() -> None:
+    database = KeyframeDatabase()
+    places = [descriptors(200) for _ in range(70)]
+    for key, each in enumerate(places):
+        database.add(key, each)
+    seen = places[41].copy()
+    seen[:100] = descriptors(100)
+    assert database.query(seen, 3)[:1] == [41]
+    assert 41 not in database.query(seen, 3, {41})
+    database.remove(41)
+    assert 41 not in database.query(seen, 3)
