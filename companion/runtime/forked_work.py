@@ -14,13 +14,13 @@ import signal
 import socket
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
 from companion.errors import CompanionError, StageError
-from companion.messages import Frame, Message
+from companion.messages import Frame
 from companion.products.surroundings import peak_memory_mb
 from companion.runtime.parcel import Parcel, allow_descriptors
 from companion.runtime.stage_protocol import Finish, Finished, Progress, Remark, Taken
@@ -39,6 +39,13 @@ class _Raised:
 
     pickled: bytes | None
     text: str
+
+    def error(self) -> BaseException:
+        """The exception, or one with its text."""
+        if self.pickled is None:
+            return StageError(self.text)
+        found: BaseException = pickle.loads(self.pickled)
+        return found
 
 
 class _Told(StageTimes):
@@ -67,6 +74,8 @@ class ForkedWork(Work):
         """Sizes of parcels that it has not taken yet, the oldest first."""
         self._given: list[Any] = []
         self._has_begun = self._has_finished = False
+        self._fault: BaseException | None = None
+        """What has ended it."""
         sys.stdout.flush()
         sys.stderr.flush()
         self._pid = os.fork()
@@ -80,59 +89,66 @@ class ForkedWork(Work):
         return self._details
 
     def begin(self, tell: Callable[[Any], None]) -> None:
-        """Wait until it has begun."""
+        """Wait until it has begun; what it raises is raised."""
         self._tell = tell
-        while not self._has_begun:
+        while not self._has_begun and self._fault is None:
             self._receive()
+        if self._fault is not None:
+            raise self._fault
 
-    def step(self, message: Any) -> Iterable[Message]:
+    def step(self, message: Any) -> Iterator[Any]:
         """Pass a message on, or let it wait for others; what has been given meanwhile."""
         self._gathered.append(message)
         if isinstance(message, Frame) or len(self._gathered) >= GATHERED:
             self._send()
-        while _is_ready(self._socket, select.POLLIN, wait=False):
+        while self._fault is None and _is_ready(self._socket, select.POLLIN, wait=False):
             self._receive()
-        return self._taken_out()
+        yield from self._taken_out()
 
-    def finish(self, finish: Finish) -> Iterable[Message]:
+    def finish(self, finish: Finish) -> Iterator[Any]:
         """Let it finish, and wait for that; the last results."""
         self._gathered.append(finish)
         self._send()
-        while not self._has_finished:
+        while not self._has_finished and self._fault is None:
             self._receive()
-        self._socket.close()
-        os.waitpid(self._pid, 0)
-        return self._taken_out()
+        if self._has_finished:
+            self._end()
+        yield from self._taken_out()
 
-    def _taken_out(self) -> list[Any]:
+    def _taken_out(self) -> Iterator[Any]:
+        """What it has given, and then raised."""
         given, self._given = self._given, []
-        return given
+        yield from given
+        if self._fault is not None:
+            raise self._fault
 
     def _send(self) -> None:
         parcel = Parcel.of(self._gathered)
         self._gathered = []
-        while sum(self._sent) > MOST_BYTES or len(self._sent) >= MOST_PARCELS:
-            self._receive()
-        while True:
+        while self._fault is None:
+            if sum(self._sent) > MOST_BYTES or len(self._sent) >= MOST_PARCELS:
+                self._receive()
+                continue
             try:
                 parcel.send(self._socket, socket.MSG_DONTWAIT)
             except BlockingIOError:  # it may wait for us to take what it gives
                 if _is_ready(self._socket, select.POLLIN | select.POLLOUT) & select.POLLIN:
                     self._receive()
-                continue
             except OSError:  # it has ended; why, it may have told
-                while True:
-                    self._receive()
-            break
-        self._sent.append(parcel.n_bytes)
+                self._receive()
+            else:
+                self._sent.append(parcel.n_bytes)
+                return
 
     def _receive(self) -> None:
-        """Take the next that it sends; its exception is raised, and its end."""
+        """Take the next that it sends."""
         try:
             parcels = Parcel.receive(self._socket)
         except (EOFError, OSError):
-            self._socket.close()
-            raise StageError(f"the process of {self._name} {self._end()}") from None
+            status = self._end()
+            how = f"was ended by {signal.Signals(-status).name}" if status < 0 else "has ended"
+            self._fault = StageError(f"the process of {self._name} {how}")
+            return
         for parcel in parcels:
             message = parcel.open()
             if isinstance(message, Taken):
@@ -145,18 +161,15 @@ class ForkedWork(Work):
             elif isinstance(message, Finished):
                 self._has_finished, self._times.told = True, message.times
             elif isinstance(message, _Raised):
-                self._socket.close()
-                os.waitpid(self._pid, 0)
-                if message.pickled is None:
-                    raise StageError(message.text)
-                raise pickle.loads(message.pickled)
+                self._end()
+                self._fault = message.error()
             else:
                 self._given += message
 
-    def _end(self) -> str:
-        _, status = os.waitpid(self._pid, 0)
-        code = os.waitstatus_to_exitcode(status)
-        return f"was ended by {signal.Signals(-code).name}" if code < 0 else "has ended"
+    def _end(self) -> int:
+        """Wait for its end; the exit status."""
+        self._socket.close()
+        return os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
 
 
 def _is_ready(of: socket.socket, events: int, wait: bool = True) -> int:

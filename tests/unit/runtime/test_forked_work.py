@@ -103,8 +103,23 @@ def test_what_it_raises_is_raised_here(
     work = forked(monkeypatch, fails, [])
     with pytest.raises(type(error), match=str(error.args[-1])):
         for seq in range(1000):
-            work.step(frame(seq))
+            list(work.step(frame(seq)))
     assert ("Traceback" in capfd.readouterr().err) == isinstance(error, KeyError)
+
+
+def test_what_was_given_before_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gives(message: Any) -> list[Any]:
+        if message.seq == 20:
+            raise MemoryError("no room")
+        return [message]
+
+    work = forked(monkeypatch, gives, [])
+    given: list[Any] = []
+    with pytest.raises(MemoryError, match="no room"):
+        for seq in range(1000):
+            for out in work.step(frame(seq)):
+                given.append(out.seq)
+    assert given == list(range(20))
 
 
 def test_a_driver_that_crashes_ends_the_process_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -114,7 +129,7 @@ def test_a_driver_that_crashes_ends_the_process_alone(monkeypatch: pytest.Monkey
 
     work = forked(monkeypatch, crashes, [])
     with pytest.raises(StageError, match="the process of depth was ended by SIGKILL"):
-        work.finish(NOT_HURRIED)
+        list(work.finish(NOT_HURRIED))
 
 
 def test_results_of_a_process_that_fails_are_told(
@@ -123,7 +138,7 @@ def test_results_of_a_process_that_fails_are_told(
     def fails(message: Any) -> list[Any]:
         raise OSError(28, "no room")
 
-    forked(monkeypatch, lambda message: [], []).finish(NOT_HURRIED)
+    list(forked(monkeypatch, lambda message: [], []).finish(NOT_HURRIED))
     monkeypatch.setattr(Echo, "finish", lambda self, finish: fails(finish))
     monkeypatch.setattr("os.listdir", lambda path: ["one thread"])
     stages = InOrder(
