@@ -75,7 +75,7 @@ class ForkedWork(Work):
         self._given: list[Any] = []
         self._has_begun = self._has_finished = False
         self._fault: BaseException | None = None
-        """What has ended it."""
+        """The exception that has ended it."""
         sys.stdout.flush()
         sys.stderr.flush()
         self._pid = os.fork()
@@ -116,7 +116,7 @@ class ForkedWork(Work):
         yield from self._taken_out()
 
     def _taken_out(self) -> Iterator[Any]:
-        """What it has given, and then raised."""
+        """Messages that it has given; then raises what it raised."""
         given, self._given = self._given, []
         yield from given
         if self._fault is not None:

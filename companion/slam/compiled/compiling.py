@@ -41,11 +41,11 @@ images, patches = given(types.uint8, 2), given(types.uint8, 3)
 cache_errors: list[str] = []
 """Reasons why kernels could not be cached or loaded; each start then compiles them."""
 HERE = circumstances(numba.__version__, llvmlite.__version__)
-"""What machine code depends on, besides the processor."""
+"""All that machine code depends on besides the processor."""
 shipped = ShippedCode(FOLDER, HERE)
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 _loops: dict[str, Any] = {}
-"""What numba has made of each loop, by `module.name`."""
+"""Compiled loops, by `module.name`."""
 
 
 def compiled(*arguments: Any) -> Callable[[Loop], Loop]:

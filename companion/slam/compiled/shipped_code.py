@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 FOLDER = Path(__file__).parent / "code"
-"""Where a package has it; a clone, or what pip has installed, has none."""
+"""Folder of a package that has it; a clone, or what pip has installed, has none."""
 MADE_FOR = "made_for.json"
 
 

@@ -39,7 +39,7 @@ def words_of_bits(descriptors: Bytes, bits: Ints) -> Words:
 
 @compiled(words_given, words_given)
 def equal_spans(among: Words, words: Words) -> tuple[Ints, Ints]:
-    """Where each of `words` (M,) begins among others, and how often it is there; both sorted."""
+    """Index of each of `words` (M,) among others, and how often it is there; both sorted."""
     n, m = len(among), len(words)
     begins, counts = np.empty(m, np.int64), np.empty(m, np.int64)
     at = 0
