@@ -234,6 +234,7 @@ def test_a_file_that_cannot_be_written_is_named(name: str, tmp_path: Path) -> No
 def test_it_leaves_room_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The results come after it, and are worth more."""
     monkeypatch.setattr(rrd_files, "LEFT_FREE_BYTES", 1 << 62)
+    monkeypatch.setattr(rrd_files, "LOOK_BYTES", 1 << 14)
     path = tmp_path / "f.rrd"
     with pytest.raises(OSError) as caught, FileViewer(ViewerConfig(), CAMERA, path) as viewer:
         for seq in range(100):
