@@ -45,7 +45,7 @@ OF_FRAME = {
     "telemetry": ESTIMATION + "localisation:LocalisationStage._take_samples",
     "attitude, checked": ESTIMATION + "attitude_checks:AttitudeChecks.check",
     "odometry": ESTIMATION + "body_odometry:BodyOdometry.of_track",
-    "motion filter": ESTIMATION + "motion_filter:MotionFilter.correct",
+    "motion filter": ESTIMATION + "body.body_filter:BodyFilter.at",
     "corrections of the map": ESTIMATION + "body_odometry:BodyOdometry.apply_map_correction",
     "shutter": ESTIMATION + "shutter.shutter_of_frames:ShutterOfFrames.end",
     "site map": ESTIMATION + "site.site_in_flight:SiteInFlight.frame",
