@@ -16,9 +16,11 @@ from companion.slam.compiled.compiling import (
     integer,
     integers,
     numbers,
+    small_integer,
 )
 
 Words = NDArray[np.uint32]
+Rows = NDArray[np.int32]
 words_given = given(half_word, 1)
 
 
@@ -64,8 +66,8 @@ def equal_spans(among: Words, words: Words) -> tuple[Ints, Ints]:
     return begins, counts
 
 
-@compiled(numbers, integers, integers, integers, numbers)
-def with_weights(scores: Array, owners: Ints, begins: Ints, counts: Ints, weights: Array) -> Array:
+@compiled(numbers, given(small_integer, 1), integers, integers, numbers)
+def with_weights(scores: Array, owners: Rows, begins: Ints, counts: Ints, weights: Array) -> Array:
     """Scores with the weight of each word added to each of its owners."""
     out = scores.copy()
     for i in range(len(begins)):

@@ -13,17 +13,18 @@ import numpy as np
 from companion.geometry.transforms import Array
 from companion.messages import Bytes
 from companion.slam.compiled.word_matching import (
+    Rows,
     Words,
     equal_spans,
     with_weights,
     words_of_bits,
 )
-from companion.slam.features.orb_features import Ints
 
 N_TABLES = 8
 N_BITS = 18
-BLOCK = 32
-"""Keyframes whose words are sorted together."""
+BLOCK, MERGED = 32, 8
+"""Keyframes whose words are sorted together while more come; so many such blocks become one, as
+looking for words takes about as long in a block of any size."""
 
 _CHOSEN = np.random.default_rng(20).permutation(256)[: N_TABLES * N_BITS].reshape(N_TABLES, N_BITS)
 
@@ -39,8 +40,9 @@ class _Block:
     """Sorted words of some keyframes, and the row in `keys` of the keyframe of each."""
 
     words: Words = field(default_factory=lambda: np.zeros(0, np.uint32))
-    owners: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    owners: Rows = field(default_factory=lambda: np.zeros(0, np.int32))
     n_keys: int = 0
+    is_merged: bool = False
 
 
 class KeyframeDatabase:
@@ -61,7 +63,7 @@ class KeyframeDatabase:
 
     def add(self, key: int, descriptors: Bytes) -> None:
         """Add the descriptors (N, 32) of a keyframe."""
-        block = next((b for b in self._blocks if b.n_keys < BLOCK), None)
+        block = next((b for b in self._blocks if b.n_keys < BLOCK and not b.is_merged), None)
         if block is None:
             block = _Block()
             self._blocks.append(block)
@@ -75,8 +77,23 @@ class KeyframeDatabase:
         words = words_of(descriptors)
         at = np.searchsorted(block.words, words)
         block.words = np.insert(block.words, at, words)
-        block.owners = np.insert(block.owners, at, np.full(len(words), row))
+        block.owners = np.insert(block.owners, at, np.full(len(words), row, np.int32))
         block.n_keys += 1
+        self._merge()
+
+    def _merge(self) -> None:
+        """Make one block of full ones, once there are enough; a score does not depend on it."""
+        full = [b for b in self._blocks if b.n_keys == BLOCK and not b.is_merged]
+        if len(full) < MERGED:
+            return
+        words = np.concatenate([b.words for b in full]).astype(np.int64)
+        both = np.sort(words << 32 | np.concatenate([b.owners for b in full]))
+        merged = _Block(
+            (both >> 32).astype(np.uint32), both.astype(np.int32), BLOCK * MERGED, is_merged=True
+        )
+        gone = set(map(id, full))
+        self._blocks = [b for b in self._blocks if id(b) not in gone] + [merged]
+        self._block_of = [merged if id(b) in gone else b for b in self._block_of]
 
     def remove(self, key: int) -> None:
         """Remove a keyframe."""

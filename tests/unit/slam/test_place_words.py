@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from companion.messages import Bytes
 from companion.slam.compiled.word_matching import equal_spans, with_weights
+from companion.slam.loop import place_recognition
 from companion.slam.loop.place_recognition import (
     _CHOSEN,
     N_BITS,
@@ -39,9 +41,13 @@ def test_spans_are_those_of_a_search() -> None:
 
 
 def test_weights_go_to_owners() -> None:
-    owners = np.array([0, 2, 2, 1])
+    owners = np.array([0, 2, 2, 1], np.int32)
     scores = with_weights(
-        np.ones(3), owners, np.array([0, 3]), np.array([3, 1]), np.array([0.5, 2.0])
+        np.ones(3),
+        owners,
+        np.array([0, 3]),
+        np.array([3, 1]),
+        np.array([0.5, 2.0]),
     )
     assert scores.tolist() == [1.5, 3.0, 2.0]
 
@@ -57,3 +63,30 @@ def test_the_keyframe_that_shares_words_is_found() -> None:
     assert 41 not in database.query(seen, 3, {41})
     database.remove(41)
     assert 41 not in database.query(seen, 3)
+
+
+def test_scores_do_not_depend_on_how_keyframes_are_kept_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(place_recognition, "BLOCK", 4)
+    monkeypatch.setattr(place_recognition, "MERGED", 3)
+    database = KeyframeDatabase()
+    seen = descriptors(60)
+    of_key = {}
+    for key in range(50):
+        each = np.concatenate([seen[RANDOM.random(60) < 0.2], descriptors(20)])
+        database.add(key, each)
+        of_key[key] = words_of(each)
+        if key % 7 == 6:
+            database.remove(key - 5)
+            del of_key[key - 5]
+    assert sum(block.is_merged for block in database._blocks) >= 2
+    words = words_of(seen)
+    rarity = {
+        word: np.log1p(len(of_key) / (1.0 + sum(word in each for each in of_key.values())))
+        for word in words.tolist()
+    }
+    scores = dict(zip(database._keys, database._scores(words).tolist(), strict=True))
+    for key, own in of_key.items():
+        shared = np.intersect1d(own, words).tolist()
+        assert scores[key] == sum((rarity[word] for word in shared), 0.0)
