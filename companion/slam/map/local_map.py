@@ -92,7 +92,11 @@ def local_points(slam_map: SlamMap, near_ids: Ints, centre: Array, n_keyframes: 
     """
     chosen = [k for _, k in slam_map.covisible(near_ids, 8)[:n_keyframes]]
     chosen += slam_map.nearest(centre, N_NEAREST, set(chosen))
-    mask = np.zeros(slam_map.n_points, bool)
-    for keyframe_id in chosen:
-        mask[slam_map.observations_of(slam_map.keyframes[keyframe_id])[1]] = True
-    return np.flatnonzero(mask)
+    seen = [slam_map.observations_of(slam_map.keyframes[each])[1] for each in chosen]
+    ids = np.concatenate(seen) if seen else np.zeros(0, np.int64)
+    if not len(ids):
+        return ids
+    lowest = int(ids.min())  # on new ground their numbers lie together, in a map of any size
+    mask = np.zeros(int(ids.max()) - lowest + 1, bool)
+    mask[ids - lowest] = True
+    return np.flatnonzero(mask) + lowest

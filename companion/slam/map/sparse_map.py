@@ -124,8 +124,11 @@ class SlamMap:
     """Id (P,) of the keyframe at which the point was created."""
     first_seen: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """Id (P,) of the keyframe with the reference view of the patch."""
-    _centres: Array | None = None
+    _centres: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    """Of the keyframes `_ids`, at their poses `_posed`."""
     _ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    _posed: dict[int, Pose] = field(default_factory=dict)
+    _are_centres_known: bool = False
     first_unproject: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
     """Jacobian of the reference view's normalised coordinates by its pixels"""
     patch_at: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -357,16 +360,34 @@ class SlamMap:
 
     def invalidate_centres(self) -> None:
         """Invalidate cached camera centres after keyframes were added or moved."""
-        self._centres = None
+        self._are_centres_known = False
+
+    def _update_centres(self) -> None:
+        """Centres of those that are new or moved; the others, most of a large map, are kept."""
+        posed = {key: k.camera_from_map for key, k in self.keyframes.items()}
+        ids = np.fromiter(posed, np.int64, len(posed))
+        at = np.minimum(np.searchsorted(self._ids, ids), max(len(self._ids) - 1, 0))
+        if len(self._ids):
+            centres, known = self._centres[at], (self._ids[at] == ids).tolist()
+        else:
+            centres, known = np.empty((len(ids), 3)), [False] * len(ids)
+        for row, (key, pose) in enumerate(posed.items()):
+            if not known[row] or self._posed.get(key) is not pose:
+                centres[row] = self.keyframes[key].centre
+        self._ids, self._centres, self._posed = ids, centres, posed
+        self._are_centres_known = True
 
     def nearest(self, centre: Array, n: int, exclude: set[int]) -> list[int]:
         """Ids of the `n` keyframes nearest to a position (3,), without those in `exclude`."""
-        if self._centres is None:
-            self._centres = np.stack([k.centre for k in self.keyframes.values()])
-            self._ids = np.array(list(self.keyframes))
+        if not self._are_centres_known:
+            self._update_centres()
         apart = np.linalg.norm(self._centres - centre, axis=1)
-        order = np.argsort(apart, kind="stable")[: n + len(exclude)]
-        return [k for k in self._ids[order].tolist() if k not in exclude][:n]
+        most = n + len(exclude)
+        near = np.arange(len(apart))
+        if most < len(apart):
+            near = np.flatnonzero(apart <= np.partition(apart, most - 1)[most - 1])
+        near = near[np.argsort(apart[near], kind="stable")][:most]
+        return [k for k in self._ids[near].tolist() if k not in exclude][:n]
 
     def point_positions(self) -> Array:
         """Positions (M, 3) of all living points."""

@@ -45,6 +45,32 @@ def test_nearest_keyframes_follow_moved_ones(slam_map: SlamMap) -> None:
     assert 20 in slam_map.nearest(place, 3, {3})
 
 
+def test_nearest_keyframes_are_those_of_a_search_of_all(slam_map: SlamMap) -> None:
+    random = np.random.default_rng(2)
+
+    def searched(place: Array, n: int, exclude: set[int]) -> list[int]:
+        apart = {k: np.linalg.norm(f.centre - place) for k, f in slam_map.keyframes.items()}
+        return [k for k in sorted(apart, key=lambda k: apart[k]) if k not in exclude][:n]
+
+    for turn in range(60):
+        keys = list(slam_map.keyframes)
+        key = keys[random.integers(len(keys))]
+        if turn % 3 == 0:
+            pose = slam_map.keyframes[key].camera_from_map
+            slam_map.keyframes[key].camera_from_map = Pose(
+                pose.rotation, pose.translation + random.normal(size=3)
+            )
+        elif turn % 7 == 1:
+            del slam_map.keyframes[key]
+        elif turn % 7 == 5:  # as when maps are merged, not in order
+            slam_map.keyframes[key] = slam_map.keyframes.pop(key)
+        slam_map.invalidate_centres()
+        place = random.normal(scale=10.0, size=3)
+        exclude = set(random.choice(keys, 3).tolist())
+        for n in (1, 4, len(keys)):
+            assert slam_map.nearest(place, n, exclude) == searched(place, n, exclude)
+
+
 def test_patch_rows_of_removed_points_are_reused(slam_map: SlamMap) -> None:
     keyframe = slam_map.keyframes[0]
     size = len(slam_map.patch_grey)
