@@ -21,6 +21,7 @@ SCRIPTS = sorted(
         *ROOT.glob("packaging/*.sh"),
         *(ROOT / "packaging/deb" / each for each in ("preinst", "postinst", "prerm", "postrm")),
         ROOT / "packaging/deb/companion-back",
+        ROOT / "packaging/deb/prune.sh",
     ]
 )
 
@@ -95,6 +96,23 @@ def test_container_tells_blueos_what_it_needs() -> None:
     for setting in re.findall(r"--set (\S+)", begins):
         load_config(None, [setting])
     assert f'LABEL version="{__version__}"' in text
+
+
+def test_the_package_leaves_out_what_is_never_loaded(tmp_path: Path) -> None:
+    gone = [
+        "numpy/tests/a.py", "scipy/stats/tests/data/a.npy", "pyarrow/include/arrow/api.h",
+        "pyarrow/libarrow_flight.so.2600", "pymavlink/dialects/v20/paparazzi.py",
+        "pymavlink/dialects/v20/ardupilotmega.xml",
+    ]  # fmt: skip
+    kept = [
+        "numpy/testing/a.py", "pyarrow/libarrow.so.2600", "pymavlink/dialects/v10/all.py",
+        "pymavlink/dialects/v20/ardupilotmega.py", "pymavlink/dialects/v20/__init__.py",
+    ]  # fmt: skip
+    for name in gone + kept:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    subprocess.run(["sh", ROOT / "packaging/deb/prune.sh", tmp_path], check=True, timeout=60)
+    assert {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()} == set(kept)
 
 
 def test_wheel_has_the_sample_flight() -> None:

@@ -27,13 +27,15 @@ from companion.products.run_folder import FinishedRun
 TURN_RAD = np.radians(50.0)
 """The view turns by so much from beginning to end."""
 DOWN_RAD = np.radians(38.0)
-IN_VIEW = 0.99
-"""Share of points and path that lie in the picture, and not under the inset, all the time."""
+IN_VIEW = 0.998
+"""Share of points and path that lie in the picture, and under no inset or words, all the time."""
 ACROSS = 0.4
 """The middle lies left of the picture's, at this share of the width, to make room for the inset."""
 INSET_SHARE = 0.34
 """Width of the picture, of the film's."""
 MARGIN_SHARE = 0.018
+LINE_SHARE, WORDS_SHARE = 26 / 720, 0.2
+"""Height of a line of words, of the film's, and width of the longest, of the film's."""
 INK, SOFT = (236, 238, 241), (150, 157, 166)
 AFTERWARDS_S = 2.0
 """The whole is shown for so long at the end."""
@@ -118,6 +120,7 @@ class _Scene:
         width, height = self._size.width, self._size.height
         margin = MARGIN_SHARE * width
         left, bottom = (1 - INSET_SHARE) * width - 2 * margin, 0.75 * INSET_SHARE * width + margin
+        words = WORDS_SHARE * width, height - 3.5 * LINE_SHARE * height - margin
         for distance in self._extent * np.geomspace(0.5, 3, 30):
             shares = []
             for part in parts:
@@ -127,6 +130,7 @@ class _Scene:
                         1
                     )
                     inside &= (pixels[:, 0] < left) | (pixels[:, 1] > bottom)
+                    inside &= (pixels[:, 0] > words[0]) | (pixels[:, 1] < words[1])
                     shares.append(inside.mean())
             if min(shares) >= IN_VIEW:
                 break
@@ -150,14 +154,15 @@ class _Scene:
             f"{self._flown[at]:.0f} {unit} flown{height}",
             f"{n_points:,} points",
         ]
-        scale = self._size.height / 720
+        height_px = self._size.height
         margin = round(MARGIN_SHARE * self._size.width)
         for k, line in enumerate(lines):
-            place_px = (margin, self._size.height - margin - round(26 * scale * (2 - k)))
+            place_px = margin, height_px - margin - round(LINE_SHARE * height_px * (2 - k))
             ink = INK if k == 0 else SOFT
             cv2.putText(
-                out, line, place_px, cv2.FONT_HERSHEY_DUPLEX, 0.62 * scale, ink, 1, cv2.LINE_AA
-            )
+                out, line, place_px, cv2.FONT_HERSHEY_DUPLEX, 0.62 * height_px / 720, ink, 1,
+                cv2.LINE_AA,
+            )  # fmt: skip
 
 
 def _newest(

@@ -15,7 +15,8 @@ from companion.products.report.cloud_views import view_axes
 FOCAL_PER_HEIGHT = 1.2
 TOP, BOTTOM = np.array([24, 28, 34.0]), np.array([11, 13, 16.0])
 """Background, RGB."""
-PATH, CAMERA = (90, 170, 255), (250, 168, 51)
+PATH, CAMERA = (255, 176, 33), (90, 170, 255)
+"""As in the report and the viewer: the path is orange."""
 SUB_PX = 4
 """Bits of a pixel's fraction in cv2's lines."""
 STRENGTH = 7.0
