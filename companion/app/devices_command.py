@@ -7,8 +7,9 @@ import json
 from itertools import groupby
 from typing import Any
 
-from companion.compute.compute_devices import remeasured_devices
+from companion.compute.compute_devices import remeasured_devices, unwritable_cache
 from companion.dense.device_choice import MeasuredDevice, in_order, why_taken
+from companion.dense.opencl import WANT
 from drivers.camera.camera_devices import CameraControl, CameraDevice, CameraFormat, cameras
 from drivers.system.serial_devices import SerialDevice, serial_devices
 
@@ -69,7 +70,7 @@ def opencl_lines(compute: list[MeasuredDevice], verbose: bool) -> list[str]:
             lines += [f"       {line}" for line in said if line.strip()]
     taken = in_order(compute)[:1]
     if not compute:
-        lines.append("  none")
+        lines.append(f"  none: {WANT}{unwritable_cache()}")
     elif not taken:
         lines.append("  auto takes none of them")
     else:

@@ -6,7 +6,9 @@ and results cached (device_verdict).
 
 from __future__ import annotations
 
+import os
 import sys
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -80,9 +82,27 @@ def choose_devices(
 
 def _none(found: Sequence[MeasuredDevice]) -> str:
     if not found:
-        return f"no OpenCL device on this machine: {WANT}"
+        return f"no OpenCL device on this machine: {WANT}{unwritable_cache()}"
     refused = "; ".join(f"{each.named}: {each.problem}" for each in found)
     return f"no OpenCL device that works: {refused}: {WANT}"
+
+
+def unwritable_cache(environment: Mapping[str, str] = os.environ) -> str:
+    """Words for PoCL's folder of built kernels, without which it has no device; "" if it is well.
+
+    Without a home it takes one of its own.
+    """
+    caches, home = environment.get("XDG_CACHE_HOME", ""), environment.get("HOME", "")
+    folder = environment.get("POCL_CACHE_DIR", "") or caches or (home and f"{home}/.cache")
+    try:
+        if folder:
+            os.makedirs(folder, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+    except OSError as error:
+        why = f"cannot be written ({error.strerror}); POCL_CACHE_DIR names another"
+        return f". PoCL needs a folder for what it builds: {folder} {why}"
+    return ""
 
 
 def _known(

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import fcntl
 import math
+import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from companion.app.stopping import StopSignals
@@ -61,6 +64,27 @@ def made_folder(path: Path | None) -> None:
     except OSError as error:
         why = error.strerror or error
         raise InputError(f"{path}: cannot be written: {why}; --out wants a folder") from error
+
+
+@contextmanager
+def held_folder(path: Path) -> Iterator[None]:
+    """Make the folder of --out, and hold it; InputError where another run writes into it.
+
+    Two runs would leave the path of one beside the cloud of the other.
+    """
+    made_folder(path)
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # a file system without locks
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError(
+                    f"{path}: another run writes into it; wait for its end, or give another --out"
+                ) from None
+        yield
+    finally:
+        os.close(folder)
 
 
 def names(text: str) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from companion.app.cli.options import (
     amount,
     configuration,
     count,
+    held_folder,
     json_option,
     made_folder,
     number,
@@ -122,13 +123,13 @@ def _batch(arguments: argparse.Namespace, signals: StopSignals) -> int:
     """Replay many; 1 where one has failed."""
     from companion.app.batch_command import INDEX, batch
 
-    made_folder(arguments.out)
-    results, maps = batch(
-        arguments.flights, arguments.out, load_config(arguments.config, arguments.set),
-        scheduler=arguments.scheduler, n_workers=arguments.workers,
-        progress=signals.between_frames(progress_on(sys.stderr, "", "flights")),
-        merge=arguments.merge,
-    )  # fmt: skip
+    with held_folder(arguments.out):
+        results, maps = batch(
+            arguments.flights, arguments.out, load_config(arguments.config, arguments.set),
+            scheduler=arguments.scheduler, n_workers=arguments.workers,
+            progress=signals.between_frames(progress_on(sys.stderr, "", "flights")),
+            merge=arguments.merge,
+        )  # fmt: skip
     failed = [result for result in results if result.error]
     for result in failed:
         print(f"companion: {result.name}: {result.error}", file=sys.stderr)

@@ -11,8 +11,8 @@ from typing import Any
 from companion.app.cli.options import (
     Command,
     configuration,
+    held_folder,
     json_option,
-    made_folder,
     names,
     seconds,
     shift,
@@ -64,8 +64,8 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
             )
         from companion.app.replay.as_flown import replay_as_flown
 
-        made_folder(arguments.out)
-        replay_as_flown(arguments.flight, arguments.out, config, progress, print)
+        with held_folder(arguments.out):
+            replay_as_flown(arguments.flight, arguments.out, config, progress, print)
         signals.take()
         return 0
     with uncollected():
@@ -82,10 +82,10 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         print(f"telemetry: {belief}")
     for fault in given.warnings:
         print(f"warning: {fault.what}: {fault.detail}")
-    made_folder(arguments.out)
-    replay(given, arguments.out, config, arguments.viewer, progress, print)
-    if config.export.formats:
-        _export_into(arguments.out, arguments.out, config, arguments.flight)
+    with held_folder(arguments.out):
+        replay(given, arguments.out, config, arguments.viewer, progress, print)
+        if config.export.formats:
+            _export_into(arguments.out, arguments.out, config, arguments.flight)
     print(f"report: {arguments.out / 'report.html'}")
     signals.take()
     return 0

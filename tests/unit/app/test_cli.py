@@ -11,8 +11,10 @@ import pytest
 
 from companion import __version__
 from companion.app.cli import COMMANDS, READER_GONE, main
+from companion.app.cli.options import held_folder
 from companion.config import Config
 from companion.config_file import load_config
+from companion.errors import InputError
 from companion.products.export.exports import PRODUCTS
 from tests.support.processes.closed_pipe import into_closed_pipe
 
@@ -159,6 +161,16 @@ def test_a_file_that_the_disk_does_not_take_is_named(
     assert main(["devices"]) == 1
     why = "out/cloud.ply cannot be written: No space left on device"
     assert capsys.readouterr().err == f"companion: error: {why}\n"
+
+
+def test_two_runs_do_not_write_into_one_folder(tmp_path: Path) -> None:
+    with held_folder(tmp_path / "out"):
+        line = refused(companion("replay", SAMPLE, "--out", tmp_path / "out", "--stop", "0.2"))
+        with pytest.raises(InputError), held_folder(tmp_path / "out"):
+            pass
+    assert "another run writes into it" in line
+    with held_folder(tmp_path / "out"):
+        pass  # it ends with the run
 
 
 def test_errors_that_nobody_reads_end_it_too() -> None:

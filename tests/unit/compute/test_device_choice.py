@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from companion.app.devices_command import opencl_lines
-from companion.compute.compute_devices import choose_devices
+from companion.compute.compute_devices import choose_devices, unwritable_cache
 from companion.compute.device_probe import listed_devices, probed
 from companion.compute.device_verdict import (
     circumstances,
@@ -35,7 +35,7 @@ from tests.support.reference.failing_driver import fail, two_devices
 DEVICE = ListedDevice("0:0", "a device", "a platform")
 CHOOSE = """
 import json, sys
-from companion.compute.compute_devices import choose_devices
+from companion.compute.compute_devices import choose_devices, unwritable_cache
 from companion.config import OpenclConfig
 from companion.errors import DeviceError
 import companion.compute.device_probe
@@ -412,3 +412,11 @@ def test_devices_failed_in_flight_are_excluded() -> None:
     assert devices.described == "none is left; failed: it: was lost"
     with pytest.raises(DeviceError, match="none of"):
         choose_devices(OpenclConfig("no-such-device"))
+
+
+def test_a_folder_that_pocl_cannot_write_is_named(tmp_path: Path) -> None:
+    """It has no device then, as where it is not installed."""
+    assert unwritable_cache({"HOME": str(tmp_path)}) == unwritable_cache({}) == ""
+    for name in ("HOME", "XDG_CACHE_HOME", "POCL_CACHE_DIR"):
+        told = unwritable_cache({"HOME": str(tmp_path), name: "/proc/nowhere"})
+        assert "/proc/nowhere" in told and "POCL_CACHE_DIR" in told
