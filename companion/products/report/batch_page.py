@@ -64,13 +64,14 @@ def _shown(row: BatchResult, picture: bytes) -> dict[str, Any]:
     report = row.report
     unit = report.get("unit") or ""
     duration_s, length = report.get("duration_s"), report.get("path_length")
+    minutes, seconds = divmod(round(duration_s or 0), 60)
     return {
         "name": row.name,
         "flight": str(row.flight),
         "error": row.error,
         "picture": base64.b64encode(picture).decode() if picture else "",
         "when": _when(report.get("first_unix_s")),
-        "duration": f"{duration_s / 60:.1f} min" if duration_s is not None else "",
+        "duration": f"{minutes}:{seconds:02d} min" if duration_s is not None else "",
         "tracked": f"{100 * report['tracked_share']:.1f} %" if "tracked_share" in report else "",
         "length": f"{length:.0f} {unit}" if length is not None else "",
         "points": f"{report['points']:,}" if "points" in report else "",

@@ -136,7 +136,8 @@ def _poses(a: FinishedRun, b: FinishedRun) -> PoseDifference:
     common = sorted(of_a.keys() & of_b.keys())
     centres_a = np.array([of_a[t].translation for t in common]).reshape(-1, 3)
     centres_b = np.array([of_b[t].translation for t in common]).reshape(-1, 3)
-    cosines = np.array([(np.trace(of_a[t].rotation.T @ of_b[t].rotation) - 1) / 2 for t in common])
+    # by the chord, not the trace: exact for rotations that are nearly the same
+    chords = np.array([np.linalg.norm(of_a[t].rotation - of_b[t].rotation) for t in common])
     rms, scale = 0.0, 1.0
     if len(common) >= 3 and not np.array_equal(centres_a, centres_b):
         found = align(centres_b, centres_a, True)
@@ -145,7 +146,7 @@ def _poses(a: FinishedRun, b: FinishedRun) -> PoseDifference:
     return PoseDifference(
         len(of_a) - len(common), len(of_b) - len(common), np.array(common, np.int64), centres_a,
         centres_b, np.linalg.norm(centres_a - centres_b, axis=1),
-        np.degrees(np.arccos(np.clip(cosines, -1, 1))), rms, scale,
+        np.degrees(2 * np.arcsin(np.minimum(chords / np.sqrt(8), 1))), rms, scale,
     )  # fmt: skip
 
 

@@ -48,7 +48,8 @@ def test_a_run_is_the_same_as_itself(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "the same to the last bit" in capsys.readouterr().out
     assert "the same to the last bit" in (tmp_path / "out" / "compare.html").read_text()
     told = json.loads((tmp_path / "out" / "compare.json").read_text())
-    assert told["identical"] and told["poses"]["rms"] == told["cloud"]["a_to_b"]["max"] == 0
+    assert told["identical"] and told["poses"]["turned_deg_max"] == 0
+    assert told["poses"]["rms"] == told["cloud"]["a_to_b"]["max"] == 0
 
 
 def test_what_differs_is_measured_and_shown(
