@@ -18,6 +18,8 @@ UPPER_SHARE = 0.75
 """Quantile of the heights in a cell taken as its surface: above most points, below outliers."""
 MAX_CELLS = 100_000_000
 N_SPACING = 2000
+N_SIDE = 100
+"""Parts along the longer side of the area, each with one point in the spacing."""
 CELLS_PER_SPACING = 2.0
 MIN_NEIGHBOURS = 3
 FILL_STEPS = 2
@@ -75,9 +77,14 @@ def surface_of(cloud: Cloud, frame: MapFrame, cell_m: float) -> Surface:
 
 
 def _spacing(points: Array) -> float:
-    """Median distance of neighbours in plan view."""
+    """Median distance of neighbours in plan view, each part of the area counting alike.
+
+    The points of walls lie on lines there: most of a cloud of buildings, on next to no area.
+    """
     flat = points[:, :2]
-    sample = flat[:: max(1, len(flat) // N_SPACING)]
+    side = max(float(np.ptp(np.percentile(flat, [1, 99], axis=0), axis=0).max()) / N_SIDE, 1e-3)
+    _, first = np.unique(np.floor(flat / side).astype(np.int64), axis=0, return_index=True)
+    sample = flat[first[:: max(1, len(first) // N_SPACING)]]
     distance, _ = cKDTree(flat).query(sample, k=2)
     return max(float(np.median(distance[:, 1])), 1e-3)
 

@@ -27,6 +27,7 @@ from companion.products.cloud_ply import ply_parts
 from companion.products.export.cloud_copc import octree
 from companion.products.export.exports import PRODUCTS, export_run
 from companion.products.export.map_frame import map_frame
+from companion.products.export.surface import surface_of
 from companion.products.flight_result import WorldPose
 from companion.products.run_folder import FinishedRun, read_run
 from companion.products.trajectory_file import trajectory_tum
@@ -274,6 +275,25 @@ def test_nodes_have_one_point_a_cell(rng: np.random.Generator) -> None:
         assert ((within >= 0) & (within < 1)).all()
         assert len(np.unique(np.floor(within * 128), axis=0)) == len(inside)
         assert depth == 0 or (depth - 1, x // 2, y // 2, z // 2) in nodes
+
+
+def test_walls_do_not_make_the_cells_finer_than_the_ground(rng: np.random.Generator) -> None:
+    """Seen from above four walls of 200 000 points have next to no area."""
+    ground = np.stack([*np.meshgrid(np.arange(-30, 30, 0.2), np.arange(-30, 30, 0.2))], -1)
+    ground = ground.reshape(-1, 2) + rng.normal(0, 0.01, (ground.size // 2, 2))
+    along, up = rng.uniform(-10, 10, 200_000), rng.uniform(-12, 0, 200_000)
+    side = rng.choice([-10.0, 10.0], 200_000)
+    walls = np.stack([along, side, up], -1)
+    walls[::2, :2] = walls[::2, 1::-1]
+    points = np.concatenate([np.column_stack([ground, np.zeros(len(ground))]), walls])
+    n = len(points)
+    cloud = Cloud(
+        points.astype(np.float32), np.full((n, 3), 90, np.uint8), np.ones(n, np.float32),
+        np.zeros((n, 3), np.float32), np.full(n, np.nan, np.float32),
+    )  # fmt: skip
+    surface = surface_of(cloud, map_frame(None, True, 0, True), 0.0)
+    assert 0.3 < surface.cell_m < 0.5
+    assert np.isfinite(surface.height).mean() > 0.98
 
 
 def test_cells_are_not_too_many(run: FinishedRun, tmp_path: Path) -> None:
