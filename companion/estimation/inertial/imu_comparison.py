@@ -185,7 +185,7 @@ def agreement(
         after = np.flatnonzero(in_row)
         covariance[after, after + 1] = covariance[after + 1, after] = -noise / (6 * n)
         by = np.linalg.inv(np.linalg.cholesky(covariance))
-        whitened = _squares(by @ seen, by @ gyro)
+        whitened = _squares(by @ seen, _each(by, gyro))
         whitened /= max(float(whitened.min()) / (3 * n), 1.0)
     off = seen_mean - np.einsum("hab,db->hda", BODY_FROM_IMU, gyro_mean)
     chi_square = whitened + (off**2).sum(2) / SIGMA_GYRO_BIAS_RAD_S**2
@@ -200,10 +200,17 @@ def agreement(
 
 def _squares(seen: Array, gyro: Array) -> Array:
     """|seen - H gyro|2 (48, D) for all ways H and delays at once, of (N, 3) and (D, N, 3)."""
-    common = np.einsum("na,dnb->dab", seen, gyro)
+    common = _each(seen.T, gyro)
     both = float((seen**2).sum()) + (gyro**2).sum((1, 2))
     out: Array = np.maximum(both - 2.0 * np.einsum("hab,dab->hd", BODY_FROM_IMU, common), 0.0)
     return out
+
+
+def _each(by: Array, of: Array) -> Array:
+    """Products (D, M, 3) of a matrix (M, N) and each of (D, N, 3), as one of large matrices."""
+    delays, n, axes = of.shape
+    out = by @ of.transpose(1, 0, 2).reshape(n, delays * axes)
+    return out.reshape(len(by), delays, axes).transpose(1, 0, 2)
 
 
 def _white(left: Array, in_row: NDArray[np.bool_]) -> float:
