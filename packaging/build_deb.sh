@@ -37,8 +37,8 @@ sh packaging/deb/prune.sh "$prefix"/lib/python*/site-packages
 "$prefix/bin/python" -c 'import cv2, mavsdk, matplotlib.pyplot, numba, pyarrow.parquet, rerun
 import pymavlink.DFReader, pyulog, rosbags.highlevel, scipy.stats, companion.app.cli' ||
   fail "packaging/deb/prune.sh took away too much"
-# So that no start compiles them; for any processor of this architecture.
-"$prefix/bin/python" -m companion.slam.compiled.ship >/dev/null
+# So that no start compiles them; for any processor of this architecture. Not those of the clone: -I.
+"$prefix/bin/python" -I -m companion.slam.compiled.ship >/dev/null
 # Where it was made is not where it will be.
 grep -rlI "$prefix" "$prefix/bin" "$prefix/pyvenv.cfg" | xargs sed -i "s|$prefix|/opt/companion|g"
 find "$prefix" -name __pycache__ -prune -exec rm -rf {} +

@@ -194,3 +194,11 @@ def test_the_version_before_an_update_is_kept_and_comes_back(tmp_path: Path) -> 
     assert "not ready within 1 s" in run(back, "--unless-ready").stderr
     assert is_there() == ("companion 1.0", "# 1.0")
     assert yours.read_text() == "a map"
+
+
+@pytest.mark.parametrize("made_by", ["packaging/build_deb.sh", "packaging/Containerfile"])
+def test_loops_are_compiled_where_they_are_installed(made_by: str) -> None:
+    """And not those of the clone, which it is made from: -I leaves out the folder one is in."""
+    text = (ROOT / made_by).read_text("utf-8")
+    (line,) = re.findall(r".*-m companion\.slam\.compiled\.ship", text)
+    assert line.endswith("-I -m companion.slam.compiled.ship")
