@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
-from itertools import compress
+from itertools import compress, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,8 @@ from drivers.telemetry.tlog_records import LEAST_US, MOST_US, Record, TlogRecord
 
 AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 MAX_ROUND_TRIP_NS = 2_000_000_000
+BACK_US = 500_000
+"""Records of several links are written by less out of order than this."""
 
 
 def read_tlog(path: Path) -> LogContent:
@@ -49,6 +51,14 @@ def read_tlog(path: Path) -> LogContent:
     if packets.n_damaged:
         detail = f"{packets.n_damaged} of {len(log)} bytes of {path.name} passed over"
         warnings.append(Warned(first_ns, "damaged telemetry", detail))
+    steps_us = [before.unix_us - after.unix_us for before, after in pairwise(records)]
+    back_us = [step for step in steps_us if step > BACK_US]
+    if back_us:
+        detail = (
+            f"{len(back_us)} x in {path.name}, by {max(back_us) * 1e-6:.1f} s at most: the clock "
+            "of the computer was set while it recorded, and the autopilot's is not put on it well"
+        )
+        warnings.append(Warned(first_ns, "the log's time goes back", detail))
     vehicle, n_vehicles = _vehicle(records)
     if vehicle is None:
         warnings.append(Warned(first_ns, "no autopilot in the telemetry", path.name))

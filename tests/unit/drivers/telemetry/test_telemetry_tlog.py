@@ -136,6 +136,15 @@ def test_timesync(tmp_path: Path) -> None:
     assert abs(of(read_back, AttitudeSample)[0].t_ns - START_NS) < 1e6
 
 
+def test_a_clock_that_was_set_back_while_it_recorded_is_told(tmp_path: Path) -> None:
+    assert read(tmp_path, flying(4.0)).warnings == ()
+    log = Tlog(flying(4.0).data)
+    for t_ns in range(4 * S, 8 * S, S // 50):
+        log.add(START_NS + t_ns - 3 * S, attitude(BOOT_NS + t_ns, ROLL, PITCH, YAW))
+    told = {warned.what: warned.detail for warned in read(tmp_path, log).warnings}
+    assert "1 x in telemetry.tlog, by 3.0 s" in told["the log's time goes back"]
+
+
 def test_a_reboot(tmp_path: Path) -> None:
     log = flying()
     for t_ns in range(0, 5 * S, S // 50):
