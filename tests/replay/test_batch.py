@@ -30,8 +30,8 @@ def test_an_archive_is_replayed_once_and_shown_on_one_page(tmp_path: Path) -> No
     settings = "--out", out, "--workers", 2, "--set", "depth.enabled=false"
     done = batch(*flights, *settings)
     assert done.returncode == 1
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("companion: empty: ")
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("companion: empty: "), done.stderr
     assert "3 flights, 0 done before, 1 failed" in done.stdout
     for name in (FIRST, SECOND):
         assert json.loads((out / name / "report.json").read_text())["frames"] == 12

@@ -86,8 +86,8 @@ def score(run: Trajectory, truth: Trajectory) -> Score:
 
 def read_ply(path: Path) -> NDArray[np.void]:
     """Vertices as a structured array, by somebody else's reader."""
-    vertices: NDArray[np.void] = PlyData.read(path, mmap=False)["vertex"].data
-    return vertices
+    # mapped it is read as one array; read from a stream it would be vertex by vertex, 4 s a cloud
+    return np.array(PlyData.read(path)["vertex"].data)
 
 
 def read_lens(flight: Path) -> tuple[Array, Array]:

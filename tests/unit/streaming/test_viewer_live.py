@@ -26,6 +26,7 @@ from companion.streaming.onboard_viewer import GROUND
 from companion.streaming.viewer.inbox import Inbox
 from companion.streaming.viewer.screen import DISPLAYS, GRPC_PORT, WEB_PORT, listens
 from tests.support.flights import flown
+from tests.support.waiting import until
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 
@@ -132,14 +133,10 @@ def test_a_port_in_use_is_reported_and_opened_when_free() -> None:
         with LiveViewer(
             ViewerConfig(), CAMERA, stream=StreamConfig(listen=f"127.0.0.1:{port}")
         ) as viewer:
-            end = time.monotonic() + 10
-            while not closed(viewer) and time.monotonic() < end:
-                time.sleep(0.02)
-            assert "in use" in closed(viewer)
+            until(lambda: "in use" in closed(viewer))
             other.close()
-            while closed(viewer) and time.monotonic() < end:
-                time.sleep(0.02)
-            assert not closed(viewer) and listens("127.0.0.1", port)
+            until(lambda: not closed(viewer))
+            assert listens("127.0.0.1", port)
 
 
 @pytest.mark.parametrize("where", ["rerun+http://127.0.0.1:1/proxy", "rerun+http:///proxy"])
