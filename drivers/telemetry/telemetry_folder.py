@@ -73,7 +73,7 @@ def read_telemetry(
     """Telemetry of these logs, or without any of the video itself, on the flight's clock.
 
     Of several logs the one that covers most of the images' time. FlightError where there are logs
-    and none covers it.
+    and none covers it, or where one was named and holds nothing.
     """
     found = [(path, aligned(read_log_file(path), pictures, config)) for path in paths]
     if not paths:
@@ -97,6 +97,12 @@ def read_telemetry(
     if apart:
         raise FlightError(_of_another_time(*apart[0], pictures))
     path, log = found[0]
+    if config.log:
+        why = "; ".join(f"{each.what}: {each.detail}" for each in log.warnings)
+        raise FlightError(
+            f"{path}: no telemetry that can be used{f' ({why})' if why else ''}; without --log, or "
+            "telemetry.log, it goes on without any"
+        )
     empty = Warned(pictures.start_ns, "no telemetry that can be used", path.name)
     return dataclasses.replace(log, warnings=(*log.warnings, empty))
 

@@ -262,6 +262,9 @@ def test_telemetry_that_is_none(folder: Path, name: str, content: bytes) -> None
     log = opened(folder).telemetry()
     assert not log.samples
     assert "no telemetry that can be used" in whats(log.warnings)
+    named = TelemetryConfig(log=str(folder / name))  # what was asked for is not passed over
+    with pytest.raises(FlightError, match=f"{name}: no telemetry that can be used"):
+        open_flight(folder, AS_FOUND, named).telemetry()
 
 
 def test_telemetry_of_another_time(folder: Path) -> None:
