@@ -1,8 +1,8 @@
 """The way back, flown by the autopilot's mission mode: a flight over a site, then one in its map.
 
 The first flight has satellites, which place the map, and flies the way to and fro. The second has
-none: it is located in the first one's map, flies out by command, fetches the way back from the
-companion, gives it to the autopilot, and lets it fly.
+none, from power-on: it is located in the first one's map, flies out by command, fetches the way
+back from the companion, gives it to the autopilot, and lets it fly.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from tests.firmware import manoeuvres
 from tests.firmware.features import OWN_SOURCES, up_by_gps
 from tests.firmware.figures import Figures, percentile
 from tests.firmware.missions import fetched, uploaded
-from tests.firmware.pilots import SET_EKF_SOURCE_SET
-from tests.firmware.trial import Conditions, Trial
+from tests.firmware.trial import ON_OUR_POSE, WITHOUT_GPS, Conditions, Trial
 
 WAY_M = ((12.0, 0.0), (12.0, 8.0))
 FLOWN_S, LOCATED_S = 60.0, 30.0
@@ -38,8 +37,7 @@ def way_back(trial: Trial, figures: Figures) -> None:
     figures.add_true("the first flight leaves its map", saved is not None, str(saved))
     if saved is None:
         return
-    trial.pilot.lose_gps()
-    trial.ground.command(SET_EKF_SOURCE_SET, 2.0)
+    _restart_without_gps(trial)
     _use_map(trial, saved)
     if manoeuvres.up(trial, figures):
         _out_and_back(trial, figures)
@@ -90,6 +88,17 @@ def _is_back(trial: Trial, set_out_m: Array, began_s: float) -> bool:
 
 def _is_located(trial: Trial) -> bool:
     return any("located in the saved map" in text for _, text in trial.ground.texts)
+
+
+def _restart_without_gps(trial: Trial) -> None:
+    """Off and on again, as in a shed: no receiver, our pose in the first source set."""
+    firmware = trial.firmware
+    firmware.parameters |= WITHOUT_GPS[firmware.name] | ON_OUR_POSE[firmware.name]
+    firmware.restart()
+    trial.mark("autopilot restarted, without GPS")
+    time.sleep(manoeuvres.SETTLE_S)
+    trial.ground.until(lambda: time.time() - trial.ground.came_s["HEARTBEAT"] < 1.0, 30.0)
+    trial.ground.ask_for_messages()
 
 
 def _use_map(trial: Trial, saved: Path) -> None:
