@@ -36,6 +36,7 @@ from companion.telemetry import (
     Telemetry,
 )
 from tests.support.flights.noisy_telemetry import with_noise
+from tests.support.flights.reach import Reach
 from tests.support.flights.scene import leaves, texture
 
 CAMERA_DOWN = Pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
@@ -48,45 +49,11 @@ METRES_PER_TEXEL = 0.05
 IMU_S, IMU_STEP_S = 0.01, 1e-3
 """Interval of an IMU, and the step of the differences that it is drawn from."""
 GRAVITY_NED = np.array([0.0, 0.0, 9.80665])
-TILE_PX = 16
 N_EXPOSED = 6
 """Pictures in one exposure."""
 
 PathOf = Callable[[float], Pose]
 """`ned_from_body` by seconds since the start."""
-
-
-class Reach:
-    """Where in a picture a level may show, by tiles of it: most of it meets no roof.
-
-    `rays` (3, H, W) are in NED.
-    """
-
-    def __init__(self, rays: np.ndarray) -> None:
-        height, width = rays.shape[1:]
-        self._tops, self._lefts = np.arange(0, height, TILE_PX), np.arange(0, width, TILE_PX)
-        slopes = rays[:2] / rays[2]
-        least, most = (
-            each.reduceat(each.reduceat(slopes, self._tops, 1), self._lefts, 2)
-            for each in (np.minimum, np.maximum)
-        )
-        self._ranges = least, most
-
-    def part(
-        self, centre: np.ndarray, height: float, place: tuple[float, float, float, float]
-    ) -> tuple[slice, slice] | None:
-        """Rows and columns from the first to the last that may show a level; None without any."""
-        least, most = self._ranges
-        down = height - float(centre[2])
-        corners = np.array(place).reshape(2, 2, 1, 1) - centre[:2].reshape(2, 1, 1)
-        low, high = np.sort(corners / down, 0) + np.array([-1e-3, 1e-3]).reshape(2, 1, 1, 1)
-        tiles = ~((most < low) | (least > high)).any(0)  # nan, at the horizon, is no reason
-        rows, columns = tiles.any(1).nonzero()[0], tiles.any(0).nonzero()[0]
-        if not len(rows):
-            return None
-        top, left = self._tops[rows[0]], self._lefts[columns[0]]
-        below, right = self._tops[rows[-1]] + TILE_PX, self._lefts[columns[-1]] + TILE_PX
-        return slice(top, below), slice(left, right)
 
 
 class Terrain:

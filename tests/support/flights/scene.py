@@ -8,6 +8,7 @@ import numpy as np
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Bytes, Floats
+from tests.support.flights.reach import Reach
 
 
 def texture(rng: np.random.Generator, size: int = 1024) -> Bytes:
@@ -70,24 +71,27 @@ class PlaneWorld:
 
     def render(self, camera: Camera, world_from_camera: Pose) -> tuple[Bytes, Floats]:
         """Grey image and z-depth (0: nothing) of an undistorted or distorted camera."""
-        rays = self.rays_of(camera) @ world_from_camera.rotation.T
-        to_north, to_east, to_down = np.ascontiguousarray(rays.T)
-        centre = world_from_camera.translation
-        image = np.full(len(rays), 128.0)
-        depth = np.full(len(rays), np.inf)
-        for height, (n0, e0, n1, e1), pattern in self._planes:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                z = (height - centre[2]) / to_down
-                north, east = centre[0] + z * to_north, centre[1] + z * to_east
-            ok = (z > 0.1) & (z < depth) & (north > n0) & (north < n1) & (east > e0) & (east < e1)
-            if not ok.any():
-                continue
-            hit = np.stack([north[ok], east[ok]], 1)
-            image[ok] = _sample(pattern, np.mod(hit / self._metres_per_texel, len(pattern) - 2))
-            depth[ok] = z[ok]
-        depth[~np.isfinite(depth)] = 0
         shape = (camera.height, camera.width)
-        return image.reshape(shape).astype(np.uint8), depth.reshape(shape).astype(np.float32)
+        turned = self.rays_of(camera) @ world_from_camera.rotation.T
+        rays = np.ascontiguousarray(turned.T).reshape(3, *shape)
+        centre = world_from_camera.translation
+        image, depth = np.full(shape, 128.0), np.full(shape, np.inf)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = Reach(rays)
+            for height, place, pattern in self._planes:
+                part = reach.part(centre, height, place)
+                if part is None:
+                    continue
+                to_north, to_east, to_down = rays[:, part[0], part[1]]
+                n0, e0, n1, e1 = place
+                z, before = (height - centre[2]) / to_down, depth[part]
+                n, e = centre[0] + z * to_north, centre[1] + z * to_east
+                ok = (z > 0.1) & (z < before) & (n > n0) & (n < n1) & (e > e0) & (e < e1)
+                texel = np.stack([n[ok], e[ok]], 1) / self._metres_per_texel
+                image[part][ok] = _sample(pattern, np.mod(texel, len(pattern) - 2))
+                before[ok] = z[ok]
+        depth[~np.isfinite(depth)] = 0
+        return image.astype(np.uint8), depth.astype(np.float32)
 
 
 def _sample(pattern: Bytes, texel: Array) -> Array:
