@@ -49,14 +49,18 @@ def read_run(folder: Path) -> FinishedRun:
     )  # fmt: skip
 
 
-def read_path(folder: Path) -> tuple[list[WorldPose], GeoOrigin | None]:
-    """Camera poses of a run, and the origin of their local NED, None where not on the globe.
+def read_path(folder: Path) -> tuple[list[WorldPose], GeoOrigin | None, Mapping[str, Any]]:
+    """Camera poses of a run, the origin of their local NED, and what its report says of the scale.
 
-    InputError where it is no run, or incomplete.
+    The origin is None where they are not on the globe. InputError where it is no run, or
+    incomplete.
     """
     report = _report(folder / "report.json")
     origin = _origin(folder / "report.json", report) if report.get("unit") == "m" else None
-    return _poses(folder / "trajectory.tum"), origin
+    scale = report.get("scale")
+    return (
+        _poses(folder / "trajectory.tum"), origin, scale if isinstance(scale, dict) else {},
+    )  # fmt: skip
 
 
 def _bytes(path: Path) -> bytes:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from companion.estimation.gate.global_gate import SATELLITES_M
+from companion.estimation.gate.global_gate import place_sigma_m
 from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned
 from companion.geometry.thinned_path import ThinnedPath
 from companion.geometry.transforms import Array
@@ -77,10 +77,10 @@ class WayBack:
             return NOTHING
         length_m = float(np.linalg.norm(np.diff(places_m, axis=0), axis=1).sum())
         reach_m = float(np.linalg.norm(places_m - places_m[-1], axis=1).max())
-        sigma_m = float(np.linalg.norm([
-            max(self._placed.residual_m, SATELLITES_M), self._placed.sigma_yaw_rad * reach_m,
-            self._placed.sigma_scale * reach_m,
-        ]))  # fmt: skip
+        placed = self._placed
+        sigma_m = place_sigma_m(
+            reach_m, placed.residual_m, placed.sigma_yaw_rad, placed.sigma_scale
+        )
         self._tell(
             WAY_BACK(n=str(len(places_m))),
             f"way back: {len(places_m)} waypoints, {length_m:.0f} m, within "

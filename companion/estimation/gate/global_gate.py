@@ -96,10 +96,10 @@ class GlobalGate:
         if self.why_not or origin is None or self._placed is None:
             return None
         flown_m = float(np.linalg.norm(position - self._placed_at_m))
-        sigma_m = float(np.linalg.norm([
-            pose.sigma_position_m, max(self._placed.residual_m, SATELLITES_M),
-            self._placed.sigma_yaw_rad * flown_m, self._placed.sigma_scale * flown_m,
-        ]))  # fmt: skip
+        placed = self._placed
+        sigma_m = float(np.hypot(pose.sigma_position_m, place_sigma_m(
+            flown_m, placed.residual_m, placed.sigma_yaw_rad, placed.sigma_scale
+        )))  # fmt: skip
         if not sigma_m <= MAX_SIGMA_M:
             self.why_not = UNCERTAIN
             return None
@@ -120,3 +120,14 @@ class GlobalGate:
         if origin is None or self._placed is None or not self._placed.has_origin:
             return NOT_PLACED
         return ""
+
+
+def place_sigma_m(
+    way_m: float, residual_m: float, sigma_yaw_rad: float, sigma_scale: float
+) -> float:
+    """Standard deviation of a place on earth, by a georeference, so far from where it was placed.
+
+    `residual_m` is left between the path and the positions that it was placed by.
+    """
+    ways_m = max(residual_m, SATELLITES_M), sigma_yaw_rad * way_m, sigma_scale * way_m
+    return float(np.linalg.norm(ways_m))

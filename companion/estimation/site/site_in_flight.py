@@ -73,7 +73,7 @@ class SiteInFlight:
         """The site map that the flight leaves; see `site_of_flight`."""
         placed = ((segment, self._georeferences.of(segment)) for segment in segments)
         metric = [(segment, found) for segment, found in placed if found is not None]
-        used = None if self._use is None else self._use.site
+        used = None if self._use is None else self._use.left
         return site_of_flight(metric, camera, flight, origin, used)
 
     def _compare(self, use: SiteUse, t_ns: int, map_from_camera: Pose | None) -> None:

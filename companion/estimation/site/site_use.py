@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from companion.geometry.camera import Camera
@@ -63,6 +65,16 @@ class SiteUse:
                 self._has_both or (found.origin is not None and not self._is_live)
             ),
         )  # fmt: skip
+
+    @property
+    def left(self) -> SiteMap:
+        """The map, as the flight is to leave it: without a place where satellites contradict it."""
+        found = self.site.georeference
+        return (
+            replace(self.site, georeference=replace(found, origin=None))
+            if self.misplaced
+            else self.site
+        )
 
     @property
     def _has_both(self) -> bool:

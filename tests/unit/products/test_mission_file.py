@@ -36,8 +36,9 @@ def test_the_path_of_a_flight_and_the_way_back(
     out = tmp_path / f"way{suffix}"
     words = ["flights", "mission", run.name, "--flights", str(run.parent), "--out", str(out)]
     assert main([*words, *["--back"] * back]) == 0
-    assert "waypoints" in capsys.readouterr().out
-    poses, origin = read_path(run)
+    said = capsys.readouterr().out
+    assert "waypoints" in said and "placed within 1.5 m" in said
+    poses, origin, _ = read_path(run)
     assert origin is not None
     path = np.stack([p.world_from_camera.translation for p in poses])
     if suffix == ".plan":

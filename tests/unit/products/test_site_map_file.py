@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -234,3 +235,15 @@ def test_commands_show_export_and_save(
     assert main(["map", "save", str(path), "--out", str(kept)]) == 0
     assert map_command.verify(kept)[1]
     assert main(["map", "show", str(tmp_path / "none.map")]) == 2
+
+
+@pytest.mark.parametrize("words", [["map", "merge"], ["compare", "--maps"]])
+def test_maps_of_other_features_are_not_put_together(
+    path: Path, site: SiteMap, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
+    other = tmp_path / "other.map"
+    write_site_map(other, replace(site, n_levels=site.n_levels + 1))
+    out = tmp_path / "both"
+    assert main([*words, str(path), str(other), "--out", str(out)]) == 2
+    assert "other features.scale_factor or n_levels" in capsys.readouterr().err
+    assert not out.is_file() and not list(out.glob("*"))

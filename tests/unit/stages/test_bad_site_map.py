@@ -17,7 +17,7 @@ from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Similarity
 from companion.messages import Frame, Georeference, Warned
 from companion.pilot_messages import OTHER, of_warning
-from companion.products.site_map_file import SiteMapError, write_site_map
+from companion.products.site_map_file import SiteMapError, read_site_map, write_site_map
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.stages.localisation_work import MAP_DAMAGED, MAP_NOT_USED, work
 from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
@@ -63,7 +63,12 @@ def letter(path: Path) -> None:
     path.write_bytes(b"Dear all,\n" * 500)
 
 
-@pytest.mark.parametrize("spoil", [cut, newer, letter, Path.unlink])
+def of_other_features(path: Path) -> None:
+    """Made with more levels of the image pyramid, and smaller steps between them."""
+    write_site_map(path, replace(read_site_map(path).site, scale_factor=1.1, n_levels=12))
+
+
+@pytest.mark.parametrize("spoil", [cut, newer, letter, Path.unlink, of_other_features])
 def test_a_flight_goes_on_without_it_and_a_replay_ends(
     path: Path, spoil: Callable[[Path], None]
 ) -> None:

@@ -146,6 +146,17 @@ def test_satellites_that_contradict_later_are_said(site: SiteMap) -> None:
     assert not use.compare(np.zeros(3), np.array([0.0, 0.0, 24.0]))  # once
 
 
+def test_a_contradicted_map_is_left_without_a_place(site: SiteMap) -> None:
+    """Whoever flies in it next is not told a place that satellites have contradicted."""
+    use = SiteUse(site, CAMERA, ORIGIN)
+    assert use.left.georeference.origin == ORIGIN
+    for _ in range(3):
+        use.compare(np.zeros(3), np.array([0.0, 25.0, 0.0]))
+    again = site_of_flight([(use.slam_map, use.georeference)], CAMERA, "noon", ORIGIN, use.left)
+    assert again is not None and again.georeference.origin is None
+    assert again.revision == 2 and again.georeference.sigma_scale == site.georeference.sigma_scale
+
+
 def test_another_camera_is_said(site: SiteMap) -> None:
     use = SiteUse(site, replace(CAMERA, fx=600.0, fy=600.0), ORIGIN)
     (warning,) = use.warnings(7)
