@@ -7,6 +7,7 @@ came in between would hide them.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,11 +37,11 @@ def points_found(
     half = 0.5 * np.array([camera.width / camera.fx, camera.height / camera.fy])
     ahead = np.flatnonzero(seen[:, 2] > 0)
     ahead = ahead[(np.abs(seen[ahead, :2]) <= 1.2 * half * seen[ahead, 2:]).all(1)]
-    is_near = np.zeros((camera.height, camera.width), bool)
-    for down in range(-MATCH_PX, MATCH_PX + 1):
-        for right in range(-MATCH_PX, MATCH_PX + 1):
-            columns, rows, _ = _inside(keypoints_px + [right, down], camera)
-            is_near[rows, columns] = True
+    is_found = np.zeros((camera.height, camera.width), np.uint8)
+    columns, rows, _ = _inside(np.asarray(keypoints_px, np.float64), camera)
+    is_found[rows, columns] = 1
+    about = np.ones((2 * MATCH_PX + 1, 2 * MATCH_PX + 1), np.uint8)
+    is_near = cv2.dilate(is_found, about) > 0
     columns, rows, which = _inside(camera.project(seen[ahead]), camera)
     return np.asarray(points_map[ahead[which][is_near[rows, columns]]])
 

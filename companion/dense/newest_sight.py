@@ -6,13 +6,20 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from companion.dense.sight_depth import sight_depth
+from companion.dense.obstacles import FREE_M, MAX_M
+from companion.dense.sight_depth import SightDepth, sight_depth
 from companion.dense.sight_tracks import MOST_IMAGES, SightTracks
+from companion.dense.sky import sky_rays
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Bytes, MapUpdate, Track
 
+MAX_RELATIVE_SIGMA = 0.08
+"""Of a depth that counts as known."""
+NEAR_BY_RAD = np.radians(2.0)
+"""From the edge of the sky to corners of what it is over; these are one in each square degree."""
 SAME_RAD, SAME_RATIO = np.radians(2.0), 0.1
 LEAST_TOGETHER = 3
 """Corners this near to one another, in direction and distance, are a thing; fewer are mistakes."""
@@ -20,11 +27,31 @@ LEAST_TOGETHER = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """Of one image: points (N, 3) in the world and where it was taken, metres, and its time."""
+    """Of one image: its time, where it was taken, metres, and the corners that it shows.
+
+    Corners have rays (N, 3), in world axes, with z 1 in the camera, inverse depths (N,) along
+    these, 1/m, their standard deviations (N,), and what they surely do not exceed (N,). Rays
+    through the sky are among them, which exceed nothing.
+    """
 
     t_ns: int
-    points_world_m: Array
     eye_world_m: Array
+    rays_world: Array
+    inverse_m: Array
+    sigma: Array
+    most_inverse_m: Array
+
+    @property
+    def is_sure(self) -> NDArray[np.bool_]:
+        """Mask (N,) of corners whose depth is known."""
+        return np.asarray(self.sigma <= MAX_RELATIVE_SIGMA * self.inverse_m)
+
+    @property
+    def points_world_m(self) -> Array:
+        """Points (M, 3) of these."""
+        sure = self.is_sure
+        away_m = self.rays_world[sure] / self.inverse_m[sure, None]
+        return np.asarray(self.eye_world_m + away_m)
 
 
 class NewestSight:
@@ -56,8 +83,24 @@ class NewestSight:
         self._tracks.step(grey, now.rotation, now.rotation.T @ last.rotation)
         if len(poses) < 2:
             return
-        points = sight_depth(self._tracks.seen, poses, self._camera.fx)
-        self.newest = Seen(track.t_ns, now.apply(points), now.translation)
+        depth = sight_depth(self._tracks.seen, poses, self._camera.fx)
+        sky = self._sky(grey, now, depth)
+        none, certain = np.zeros(len(sky)), np.ones(len(sky))
+        self.newest = Seen(
+            track.t_ns, now.translation, np.concatenate([depth.rays @ now.rotation.T, sky]),
+            np.r_[depth.inverse_m, none], np.r_[depth.sigma, certain],
+            np.r_[depth.most_inverse_m, none],
+        )  # fmt: skip
+
+    def _sky(self, grey: Bytes, world_from_camera: Pose, depth: SightDepth) -> Array:
+        """Rays (N, 3) in world axes through the sky, which is far away though it has no depth."""
+        pixels, away = self._camera.project(depth.rays), np.linalg.norm(depth.rays, axis=1)
+        far = away >= FREE_M * depth.most_inverse_m
+        near = ~far & (away < FREE_M * depth.inverse_m)
+        near &= depth.sigma <= MAX_RELATIVE_SIGMA * depth.inverse_m
+        return sky_rays(
+            grey, self._camera, world_from_camera, pixels[far], pixels[near], NEAR_BY_RAD
+        )
 
     def _place(self, track: Track, update: MapUpdate) -> tuple[int, Pose] | None:
         """Keyframe and the pose relative to it; to an earlier one while its own is not told."""
@@ -88,7 +131,8 @@ def things_in(seen: Seen, half_width_rad: float) -> Array:
     """
     from scipy.spatial import cKDTree  # 15 MB of the daemon, where obstacles are told alone
 
-    rays = seen.points_world_m - seen.eye_world_m
+    rays: Array = seen.points_world_m - seen.eye_world_m
+    rays = rays[np.linalg.norm(rays, axis=1) <= MAX_M * (1.0 + SAME_RATIO)]
     distance_m = np.linalg.norm(rays, axis=1)
     if len(rays) == 0:
         return rays

@@ -1,10 +1,9 @@
 """Distance to the nearest obstacle per sector, from the newest part of the map.
 
 Sectors are horizontal, around the vehicle, the first centred on straight ahead, clockwise in plan
-view. Unseen space is unknown, not free: a sector is free only where lines of sight pass through it,
-at the height of the vehicle, to something farther away, and only where that was seen just now.
-Obstacles stay for longer: they stand where they were seen. So a vehicle that hovers, of which depth
-knows nothing new, sees what is free turn to unknown. What no recent frame confirms is unknown too.
+view. Unseen space is unknown, not free: what is free `clear_sight` tells, by the newest image.
+Obstacles stay for longer: they stand where they were seen. What no recent frame confirms is unknown
+too.
 
 Static textured obstacles are detected; moving or untextured ones are not.
 """
@@ -26,15 +25,12 @@ SECTOR_DEG = 5.0
 UNKNOWN_CM = 65535
 MIN_POINTS = 3
 """Fewer points in a sector count as outliers."""
-NEAR_SIGHT_M = 1.0
-"""Largest distance of a line of sight from the vehicle to count for its surroundings."""
 MIN_M, MAX_M = 0.3, 20.0
 """Horizontal distances searched for obstacles; what is nearer is the vehicle itself."""
+FREE_M = 8.0
+"""Distance up to which a sector is free; in straight flight more has no parallax ahead."""
 ABOVE_M, BELOW_M = 1.0, 0.75
 """Heights searched, relative to the vehicle, along the vertical."""
-FREE_S = 2.0
-"""Age of what is seen, from its exposure, up to which it shows that nothing is in between. Depth of
-a keyframe is known a second after it."""
 STAYS_S = 15.0
 """Age up to which an obstacle stays."""
 
@@ -62,30 +58,23 @@ def unknown(t_ns: int) -> Obstacles:
 
 
 def obstacles_around(
-    t_ns: int, world_from_body: Pose, points_world_m: Array, seen_from_world_m: Array,
-    ages_s: Array,
+    t_ns: int, world_from_body: Pose, points_world_m: Array, is_free: NDArray[np.bool_],
+    reach_m: float = MAX_M,
 ) -> Obstacles:  # fmt: skip
-    """Distances from a pose to points (N, 3) seen from camera positions (N, 3), (N,) seconds ago.
+    """Distances from a pose to points (N, 3), up to `reach_m`; which sectors (72,) are free so far.
 
     The pose must be by the map of the points: a slewed one is offset.
     """
-    position = world_from_body.translation
-    finite = np.isfinite(points_world_m).all(1) & np.isfinite(seen_from_world_m).all(1)
-    points, eyes = points_world_m[finite] - position, seen_from_world_m[finite] - position
-    is_new = ages_s[finite] <= FREE_S
+    points = points_world_m[np.isfinite(points_world_m).all(1)] - world_from_body.translation
     distance_m = np.hypot(points[:, 0], points[:, 1])
     sector = sector_of(points, world_from_body)
 
-    max_cm = round(MAX_M * 100)
+    max_cm = round(reach_m * 100)
     min_cm = round(MIN_M * 100)
-    distances_cm = np.full(N_SECTORS, UNKNOWN_CM, np.uint16)
-    far = (distance_m > MAX_M) & is_new
-    through = _seen_through(points[far], eyes[far])
-    distances_cm[np.bincount(sector[far][through], minlength=N_SECTORS) >= MIN_POINTS] = max_cm + 1
-
+    distances_cm = np.where(is_free, max_cm + 1, UNKNOWN_CM).astype(np.uint16)
     down_m = points[:, 2]
     hit = (down_m >= -ABOVE_M) & (down_m <= BELOW_M)
-    hit &= (distance_m >= MIN_M) & (distance_m <= MAX_M)
+    hit &= (distance_m >= MIN_M) & (distance_m <= reach_m)
     hit_m, hit_sector = distance_m[hit], sector[hit]
     order = np.lexsort((hit_m, hit_sector))
     hit_m, hit_sector = hit_m[order], hit_sector[order]
@@ -99,32 +88,16 @@ def obstacles_around(
 
 def sector_of(points: Array, world_from_body: Pose) -> NDArray[np.int64]:
     """Sector of each point (N, 3), relative to the vehicle, in world axes."""
-    forward = world_from_body.rotation[:, 0]
-    bearing_rad = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(forward[1], forward[0])
+    bearing_rad = bearings_of(points, world_from_body)
     index: NDArray[np.int64] = np.floor(np.degrees(bearing_rad) / SECTOR_DEG + 0.5).astype(np.int64)
     return index % N_SECTORS
 
 
-def _seen_through(points: Array, eyes: Array) -> NDArray[np.bool_]:
-    """Points beyond `MAX_M` whose line of sight stays at the height of the vehicle.
-
-    The line starts at the camera and passes close to the vehicle, at the origin.
-    """
-    line = points - eyes
-    length_m = np.linalg.norm(line, axis=1)
-    direction = line / np.maximum(length_m, 1e-9)[:, None]
-    along_m = np.clip(-(eyes * direction).sum(1), 0.0, length_m)
-    closest = eyes + along_m[:, None] * direction
-    level = np.hypot(direction[:, 0], direction[:, 1])
-    end_down_m = closest[:, 2] + direction[:, 2] / np.maximum(level, 1e-9) * MAX_M
-    through: NDArray[np.bool_] = (
-        (np.linalg.norm(closest, axis=1) <= NEAR_SIGHT_M)
-        & (closest[:, 2] >= -ABOVE_M)
-        & (closest[:, 2] <= BELOW_M)
-        & (end_down_m >= -ABOVE_M)
-        & (end_down_m <= BELOW_M)
-    )
-    return through
+def bearings_of(points: Array, world_from_body: Pose) -> Array:
+    """Bearings (N,), clockwise from the vehicle's heading, of points (N, 3) in world axes."""
+    forward = world_from_body.rotation[:, 0]
+    out: Array = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(forward[1], forward[0])
+    return out
 
 
 class RecentCloud:
@@ -162,20 +135,15 @@ class RecentCloud:
         while len(self._chunks) > self._max_chunks:
             self._chunks.popitem(last=False)
 
-    def in_world(self, t_ns: int, update: MapUpdate) -> tuple[Array, Array, Array] | None:
-        """Points (N, 3), the camera positions (N, 3) that saw them, metres, and ages (N,), seconds.
-
-        None without a metric scale.
-        """
+    def in_world(self, t_ns: int, update: MapUpdate) -> Array | None:
+        """Points (N, 3), metres; None without a metric scale."""
         if update.georeference is None:
             return None
-        points, eyes, ages = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
+        points = [np.zeros((0, 3))]
         for chunk in self._chunks.values():
             place = update.place_of(chunk.keyframe_id)
             if place is None or t_ns - chunk.t_ns > self._max_age_ns:
                 continue
             world_from_camera = update.georeference.world_from_map @ place
             points.append(world_from_camera.apply(chunk.points_camera.astype(np.float64)))
-            eyes.append(np.broadcast_to(world_from_camera.translation, points[-1].shape))
-            ages.append(np.full(len(points[-1]), 1e-9 * (t_ns - chunk.t_ns)))
-        return np.concatenate(points), np.concatenate(eyes), np.concatenate(ages)
+        return np.concatenate(points)

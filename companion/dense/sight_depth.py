@@ -1,7 +1,7 @@
 """Depth of followed corners, by poses that the same corners have made exact.
 
 Poses of single frames are off by a centimetre or three across the line of sight. Over the short way
-by which a thing ahead is seen from the side that is as much as its depth. Two thousand corners tell
+by which a thing ahead is seen from the side that is as much as its depth. Hundreds of corners tell
 the relative poses to some millimetres.
 """
 
@@ -21,112 +21,134 @@ POSE_M, POSE_RATIO, POSE_RAD = 0.03, 0.02, np.radians(0.1)
 """Standard deviations of given relative poses: place, of the way between them, and attitude."""
 LEFT_RATIO = 0.005
 """Of the way between two poses: what is left of the error of its direction."""
+SIGMAS, WAY_SIGMAS = 2.0, 6.0
+"""Of what a depth does not exceed. The longest way of many is often too long: one that hovers has
+gone a decimetre and more by its poses, and what shows no parallax over that would be far away."""
 MAX_RMS_PX = 1.0
 MIN_IMAGES = 4
-MAX_RELATIVE_SIGMA = 0.08
-MOST_FOR_POSES = 700
+MOST_FOR_POSES = 350
 LEAST_FOR_POSES = 60
 ROUNDS = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SightDepth:
+    """Depths of corners that were seen along one line in enough images.
+
+    Rays (N, 3), with z 1 in the newest camera, inverse depths (N,), 1/m, standard deviations (N,)
+    of these, and what they do not exceed (N,), even if the way was shorter than the poses say.
+    """
+
+    rays: Array
+    inverse_m: Array
+    sigma: Array
+    most_inverse_m: Array
+
+
+@dataclass(slots=True, eq=False)
+class _Earlier:
+    """Relative poses of K earlier cameras: rotations (K, 3, 3) and places (K, 3) of the newest."""
+
+    rotations: Array
+    places: Array
 
 
 @dataclass(slots=True, eq=False)
 class _Estimate:
     rho: Array
-    sigma: Array
-    """Relative."""
     rms: Array
     """Distance from where the depth says it was, ideal normalised coordinates."""
     n_images: NDArray[np.int64]
+    lever: Array
+    """Most by which a corner moves for a change of rho by one."""
+    way: Array
+    """Between the cameras of that."""
 
 
-def sight_depth(seen: Array, world_from_camera: list[Pose], focal_px: float) -> Array:
-    """Points (M, 3), in the newest camera, of those corners (K, N, 2) whose depth is known.
-
-    They were seen from K poses, metres; the newest last.
-    """
+def sight_depth(seen: Array, world_from_camera: list[Pose], focal_px: float) -> SightDepth:
+    """Depths of corners (K, N, 2), seen from K poses, metres; the newest last."""
     now = world_from_camera[-1]
     relative = [pose.inverse() @ now for pose in world_from_camera[:-1]]
-    relative = _refined(seen, relative, focal_px)
-    found = _estimate(seen, relative, focal_px)
-    good = (found.n_images >= MIN_IMAGES) & (found.rho > 0)
-    good &= (found.sigma <= MAX_RELATIVE_SIGMA) & (found.rms * focal_px <= MAX_RMS_PX)
+    earlier = _Earlier(
+        np.stack([pose.rotation for pose in relative]),
+        np.stack([pose.translation for pose in relative]),
+    )
     rays = np.c_[seen[-1], np.ones(seen.shape[1])]
-    return np.asarray(rays[good] / found.rho[good, None])
+    before = seen[:-1]
+    refined = _refined(rays, before, earlier, focal_px)
+    noise_rad = CORNER_PX / focal_px if refined else float(np.hypot(CORNER_PX / focal_px, POSE_RAD))
+    found = _estimate(rays, before, earlier)
+    rho, way = found.rho, found.way
+    sigma = np.hypot(noise_rad / found.lever, rho * LEFT_RATIO * way / found.lever)
+    sure_way = np.maximum(1.0 - WAY_SIGMAS * POSE_M / np.maximum(way, 1e-9), 1e-9)
+    most = (np.maximum(rho, 0.0) + SIGMAS * sigma) / sure_way
+    good = (found.n_images >= MIN_IMAGES) & (found.rms * focal_px <= MAX_RMS_PX)
+    return SightDepth(rays[good], rho[good], sigma[good], most[good])
 
 
-def _estimate(seen: Array, relative: list[Pose], focal_px: float) -> _Estimate:
-    """Inverse depth in the newest camera, by least squares along the epipolar lines."""
-    rays = np.c_[seen[-1], np.ones(seen.shape[1])]
-    n = len(rays)
-    across, along, longest, way = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    parts = []
-    for before, pose in zip(seen, relative, strict=False):
-        turned = rays @ pose.rotation.T
-        t = pose.translation
-        moved = before - turned[:, :2] / turned[:, 2:]
-        # a point at inverse depth rho moves by rho times this
-        slope = (t[:2] - before * t[2]) / turned[:, 2:]
-        known = ~np.isnan(moved[:, 0])
-        moved, slope = np.where(known[:, None], moved, 0.0), np.where(known[:, None], slope, 0.0)
-        length = np.hypot(slope[:, 0], slope[:, 1])
-        across += (moved * slope).sum(1)
-        along += length**2
-        way = np.where(length > longest, float(np.linalg.norm(t)), way)
-        longest = np.maximum(longest, length)
-        parts.append((moved, slope, known))
-    rho = across / np.maximum(along, 1e-12)
-    n_images = np.sum([known for _, _, known in parts], axis=0, dtype=np.int64) + np.zeros(n, int)
-    squares = [((moved - rho[:, None] * slope) ** 2).sum(1) for moved, slope, _ in parts]
-    rms = np.sqrt(np.sum(squares, axis=0) / np.maximum(n_images, 1))
-    lever = np.maximum(longest, 1e-9)
-    noise = CORNER_PX / focal_px / (lever * np.maximum(np.abs(rho), 1e-9))
-    return _Estimate(rho, np.hypot(noise, LEFT_RATIO * way / lever), rms, n_images)
+def _estimate(rays: Array, before: Array, earlier: _Earlier) -> _Estimate:
+    """Inverse depth along rays (N, 3), by least squares along the epipolar lines of (K, N, 2)."""
+    turned = rays @ earlier.rotations.transpose(0, 2, 1)
+    t = earlier.places[:, None]
+    # a point at inverse depth rho moves by rho times the slope
+    moved = before - turned[..., :2] / turned[..., 2:]
+    slope = (t[..., :2] - before * t[..., 2:]) / turned[..., 2:]
+    known = ~np.isnan(before[..., 0])
+    moved[~known] = slope[~known] = 0.0
+    along = (slope**2).sum(2)
+    rho = (moved * slope).sum((0, 2)) / np.maximum(along.sum(0), 1e-12)
+    n_images = known.sum(0)
+    rms = np.sqrt(((moved - rho[:, None] * slope) ** 2).sum((0, 2)) / np.maximum(n_images, 1))
+    longest = along.argmax(0)
+    lever = np.sqrt(np.maximum(along.max(0), 1e-18))
+    way = np.linalg.norm(earlier.places, axis=1)[longest]
+    return _Estimate(rho, rms, n_images, lever, way)
 
 
-def _refined(seen: Array, relative: list[Pose], focal_px: float) -> list[Pose]:
-    """Relative poses that fit the corners, by turns with their depths; the ways keep their lengths.
+def _refined(rays: Array, before: Array, earlier: _Earlier, focal_px: float) -> bool:
+    """Fit relative poses to the corners, by turns with their depths; the ways keep their lengths.
 
-    Corners that do not fit weigh little (Cauchy).
+    Corners that do not fit weigh little (Cauchy). False where there are too few.
     """
-    found = np.flatnonzero((~np.isnan(seen[:-1, :, 0])).sum(0) >= MIN_IMAGES)
+    found = np.flatnonzero((~np.isnan(before[..., 0])).sum(0) >= MIN_IMAGES)
     if len(found) < LEAST_FOR_POSES:
-        return relative
-    seen = seen[:, found[:: -(-len(found) // MOST_FOR_POSES)]]
-    rays = np.c_[seen[-1], np.ones(seen.shape[1])]
+        return False
+    few = found[:: -(-len(found) // MOST_FOR_POSES)]
+    rays, before = rays[few], before[:, few]
     for _ in range(ROUNDS):
-        rho = np.maximum(_estimate(seen, relative, focal_px).rho, 0.0)
-        relative = [
-            _step(before, rays, rho, pose, focal_px)
-            for before, pose in zip(seen, relative, strict=False)
-        ]
-    return relative
+        rho = np.maximum(_estimate(rays, before, earlier).rho, 0.0)
+        _step(before, rays, rho, earlier, focal_px)
+    return True
 
 
-def _step(before: Array, rays: Array, rho: Array, pose: Pose, focal_px: float) -> Pose:
-    """One step of Gauss and Newton of a pose that sees points at `rho` of rays as `before`."""
-    known = ~np.isnan(before[:, 0])
-    way = float(np.linalg.norm(pose.translation))
-    if known.sum() < LEAST_FOR_POSES or way < 1e-6:
-        return pose
-    rho = rho[known]
-    turned = rays[known] @ pose.rotation.T
-    at = turned + rho[:, None] * pose.translation
-    z = np.where(at[:, 2] > 1e-3, at[:, 2], np.inf)
-    x, y = at[:, 0] / z, at[:, 1] / z
-    error = focal_px * (before[known] - np.stack([x, y], 1))
-    weight = 1.0 / (1.0 + (error**2).sum(1) / (4.0 * FOLLOWED_PX**2))
+def _step(before: Array, rays: Array, rho: Array, earlier: _Earlier, focal_px: float) -> None:
+    """One step of Gauss and Newton of poses that see points at `rho` of rays as `before`."""
+    known = ~np.isnan(before[..., 0])
+    ways = np.linalg.norm(earlier.places, axis=1)
+    turned = rays @ earlier.rotations.transpose(0, 2, 1)
+    at = turned + rho[:, None] * earlier.places[:, None]
+    z = np.where(at[..., 2] > 1e-3, at[..., 2], np.inf)
+    x, y = at[..., 0] / z, at[..., 1] / z
+    error = focal_px * (before - np.stack([x, y], 2))
+    error[~known] = 0.0
+    weight = known / (1.0 + (error**2).sum(2) / (4.0 * FOLLOWED_PX**2))
     # image motion by translation, then by rotation: (u, v) of each of six columns
-    iz, zero = focal_px / z, np.zeros(len(z))
-    by_place = np.stack([np.stack([iz, zero, -x * iz], 1), np.stack([zero, iz, -y * iz], 1)], 1)
-    a, b, c = turned.T
-    turns = np.stack([np.stack(row, 1) for row in ((zero, -c, b), (c, zero, -a), (-b, a, zero))], 1)
-    by_turn = np.einsum("nic,njc->nij", by_place, turns)
-    jacobian = np.concatenate([rho[:, None, None] * by_place, by_turn], 2)
-    weighted = jacobian * weight[:, None, None]
-    place_weight = (FOLLOWED_PX / (POSE_M + POSE_RATIO * way)) ** 2
-    prior = np.diag([place_weight] * 3 + [(FOLLOWED_PX / POSE_RAD) ** 2] * 3)
-    normal = np.einsum("nij,nik->jk", weighted, jacobian) + prior
-    step = np.linalg.solve(normal, np.einsum("nij,ni->j", weighted, error))
-    direction = pose.translation / way
-    place = step[:3] - direction * (direction @ step[:3])
-    return Pose(rotation_from_vector(step[3:]) @ pose.rotation, pose.translation + place)
+    iz, zero = focal_px / z, np.zeros(z.shape)
+    a, b, c = np.moveaxis(turned, 2, 0)
+    # of u, and of v: d/dx, d/dy and d/dz of the projection, by place times rho, by turn
+    u = np.stack([iz * rho, zero, -x * iz * rho, -x * iz * b, iz * c + x * iz * a, -iz * b], 2)
+    v = np.stack([zero, iz * rho, -y * iz * rho, -iz * c - y * iz * b, y * iz * a, iz * a], 2)
+    jacobian = np.concatenate([u, v], 1)
+    weighted = jacobian * np.concatenate([weight, weight], 1)[..., None]
+    residual = np.concatenate([error[..., 0], error[..., 1]], 1)
+    place_weight = (FOLLOWED_PX / (POSE_M + POSE_RATIO * ways)) ** 2
+    prior = np.zeros((len(ways), 6, 6))
+    prior[:, [0, 1, 2], [0, 1, 2]] = place_weight[:, None]
+    prior[:, [3, 4, 5], [3, 4, 5]] = (FOLLOWED_PX / POSE_RAD) ** 2
+    normal = weighted.transpose(0, 2, 1) @ jacobian + prior
+    gradient = (weighted.transpose(0, 2, 1) @ residual[..., None])[..., 0]
+    steps = np.linalg.solve(normal, gradient[..., None])[..., 0]
+    for k in np.flatnonzero((known.sum(1) >= LEAST_FOR_POSES) & (ways >= 1e-6)):
+        direction = earlier.places[k] / ways[k]
+        earlier.places[k] += steps[k, :3] - direction * (direction @ steps[k, :3])
+        earlier.rotations[k] = rotation_from_vector(steps[k, 3:]) @ earlier.rotations[k]

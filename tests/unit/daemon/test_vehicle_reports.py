@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 
 from companion.config import Config, FeedbackConfig
-from companion.daemon.vehicle_reports import MAX_AGE_NS, UNKNOWN_AFTER_NS, VehicleReports
-from companion.dense.obstacles import FREE_S, STAYS_S
+from companion.daemon.vehicle_reports import UNKNOWN_AFTER_NS, VehicleReports
+from companion.dense.obstacle_finder import MAX_AGE_NS
+from companion.dense.obstacles import FREE_M, STAYS_S
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import (
     DepthMap,
     Floats,
+    Frame,
     Georeference,
     MapUpdate,
     PixelState,
@@ -26,14 +28,18 @@ from companion.messages import (
     Track,
     TrackState,
 )
+from drivers.mavlink.vehicle import Firmware, Vehicle
 from tests.support.autopilot.memory_link import SetClock, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
+from tests.unit.dense.test_newest_sight import SCENE
 
 S = 1_000_000_000
 FORWARD = Pose(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.zeros(3))
 """`body_from_camera` of a camera that looks ahead."""
 CAMERA = Camera(160, 120, 110.0, 110.0, 79.5, 59.5, body_from_camera=FORWARD)
 UNKNOWN, FREE = 65535, 2001
+EYE = Camera(320, 290, 500.0, 500.0, 159.5, 144.5, body_from_camera=FORWARD)
+"""Sees all heights that are searched, and the sectors from -3 to 3."""
 METRES_PER_UNIT = 2.5
 Pole = tuple[float, float, float]
 """North, east and radius, metres."""
@@ -66,6 +72,7 @@ class Approach:
         )
         self.reports.restart(CAMERA)
         self.keyframes: dict[int, Pose] = {}
+        self.update: MapUpdate | None = None
         self.late: list[tuple[int, DepthMap]] = []
         self.position = np.zeros(3)
         across, down = np.meshgrid(np.linspace(2, 157, 40), np.linspace(20, 100, 8))
@@ -98,7 +105,8 @@ class Approach:
 
     def add_keyframe(self, keyframe_id: int, t_ns: int) -> None:
         self.keyframes[keyframe_id] = self.map_from_camera
-        self.reports.take(MapUpdate(1, t_ns, dict(self.keyframes), np.zeros((0, 3)), PLACED))
+        self.update = MapUpdate(1, t_ns, dict(self.keyframes), np.zeros((0, 3)), PLACED)
+        self.reports.take(self.update)
         depth = (depth_of(self.position, self.wall_m, self.pole) / METRES_PER_UNIT).astype(
             np.float32
         )
@@ -151,13 +159,11 @@ def test_distances_on_the_way_to_a_wall_and_a_pole() -> None:
     assert behind == {UNKNOWN}
 
 
-def test_hovering_turns_free_to_unknown_and_then_all() -> None:
+def test_an_obstacle_stays_for_a_while() -> None:
     approach = Approach(wall_m=45.0, pole=(15, 2.2, 0.1))
-    found = approach.fly(3.0)
-    assert found[0] == FREE and 0 < found[3] < 2000  # the pole
-    assert approach.fly(FREE_S + 0.1, 0.0)[0] == UNKNOWN
-    assert 0 < approach.now()[3] < 2000
-    assert set(approach.fly(STAYS_S, 0.0)) == {UNKNOWN}
+    assert 0 < approach.fly(3.0)[3] < 2000  # the pole
+    assert 0 < approach.fly(STAYS_S - 3.0, 0.0)[3] < 2000
+    assert set(approach.fly(5.0, 0.0)) == {UNKNOWN}
 
 
 def test_a_sector_that_no_newest_frame_sees_is_unknown() -> None:
@@ -181,11 +187,49 @@ def test_points_of_the_map_in_the_newest_frame_are_obstacles() -> None:
     post = np.c_[np.full(9, 8.0), np.full(9, -0.2), np.linspace(-0.5, 0.5, 9)]
     seen = CAMERA.project(FORWARD.inverse().apply(post - approach.position))
     approach.keypoints_px = np.concatenate([approach.keypoints_px, seen.astype(np.float32)])
-    update = approach.reports._map
-    assert update is not None
-    approach.reports.take(replace(update, points_map=post / METRES_PER_UNIT))
+    assert approach.update is not None
+    approach.reports.take(replace(approach.update, points_map=post / METRES_PER_UNIT))
     found = approach.fly(0.05, speed_m_s=0.0)
     assert min(found[0], found[71]) == pytest.approx(100 * (8.0 - approach.position[0]), abs=30)
+
+
+def looked(firmware: Firmware, n_images: int = 12) -> tuple[list[int], VehicleReports]:
+    """Distances by images and poses alone, past a pole of 0.3 m, 6 m ahead, before a far wall."""
+    clock: Any = SetClock()
+    link = memory_link(MemoryPort(), clock, lambda _: None)
+    link.vehicle = Vehicle(1, firmware, True, "")
+    watch: Any = None
+    config = Config(feedback=FeedbackConfig(obstacle_distance=True))
+    reports = VehicleReports(link, clock, watch, config)
+    reports.restart(EYE)
+    keyframe = Pose(np.eye(3), np.array([0.0, 0.0, -3.0])) @ FORWARD
+    world = Georeference(Similarity.identity(), 0.01, 0.01, "", 9, 0.1)
+    reports.take(MapUpdate(1, clock.t_ns, {7: keyframe}, np.zeros((0, 3)), world))
+    message: Any = None
+    for n in range(n_images):
+        pose = Pose(np.eye(3), np.array([0.0, 0.08 * n - 0.88, -3.0])) @ FORWARD
+        grey = SCENE.picture(EYE, pose)
+        reports.frame(Frame(n, clock.t_ns, grey, np.repeat(grey[..., None], 3, 2)))
+        relative = keyframe.inverse() @ pose
+        reports.take(Track(n, clock.t_ns, TrackState.TRACKING, pose, 7, relative))
+        clock.t_ns += S // 10
+        message = reports._obstacle_distance()
+    return list(message.distances), reports
+
+
+def test_images_alone_tell_of_a_pole_and_of_free_space() -> None:
+    """To PX4 what is free is told, up to where it is; to ArduPilot, which does not ask, what stands
+    farther away."""
+    told, reports = looked("px4")
+    assert min(told[1], told[2]) == pytest.approx(100 * np.hypot(6.0, 0.8), abs=60)
+    assert told[70] == told[71] == round(100 * FREE_M) + 1
+    assert set(told[5:68]) == {UNKNOWN}
+    told, _ = looked("ardupilot")
+    assert min(told[1], told[2]) == pytest.approx(100 * np.hypot(6.0, 0.8), abs=60)
+    assert told[70] == told[71] == UNKNOWN
+    reports._clock.t_ns += MAX_AGE_NS  # type: ignore[attr-defined]
+    message: Any = reports._obstacle_distance()
+    assert set(message.distances) == {UNKNOWN}
 
 
 def test_an_old_image_makes_everything_unknown_and_then_silent() -> None:

@@ -25,10 +25,15 @@ SCENE = ApproachScene([
 POLE_M = np.hypot(6.0, 0.8)
 
 
-def looked(path: Callable[[int], Array], pose_error_m: float = 0.0) -> Seen | None:
+def looked(
+    path: Callable[[int], Array],
+    pose_error_m: float = 0.0,
+    camera: Camera = CAMERA,
+    scene: ApproachScene = SCENE,
+) -> Seen | None:
     """After twelve images; the poses told are off by so much across the way, and turned."""
     rng = np.random.default_rng(3)
-    sight = NewestSight(CAMERA)
+    sight = NewestSight(camera)
     update: Any = SimpleNamespace(
         georeference=SimpleNamespace(world_from_map=Similarity.identity()),
         place_of=lambda _: Similarity.identity(),
@@ -41,7 +46,7 @@ def looked(path: Callable[[int], Array], pose_error_m: float = 0.0) -> Seen | No
         )
         told = pose @ off if pose_error_m else pose
         track = Track(n, n, TrackState.TRACKING, told, 1, told)
-        sight.add(track, SCENE.picture(CAMERA, pose), update)
+        sight.add(track, scene.picture(camera, pose), update)
     return sight.newest
 
 

@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.dense.obstacles import (
-    FREE_S,
-    UNKNOWN_CM,
-    RecentCloud,
-    obstacles_around,
-)
+from companion.dense.obstacles import N_SECTORS, UNKNOWN_CM, RecentCloud, obstacles_around
 from companion.geometry.transforms import (
     Array,
     Pose,
@@ -43,12 +38,10 @@ def at(bearing_deg: float, distance_m: float, down_m: float = 0.0, n: int = 10) 
     return out
 
 
-def distances(
-    pose: Pose, points: Array, eyes: Array | None = None, age_s: float = 0.5
-) -> dict[int, int]:
+def distances(pose: Pose, points: Array, free: tuple[int, ...] = ()) -> dict[int, int]:
     """Sectors that are known."""
-    seen_from = np.broadcast_to(pose.translation, points.shape) if eyes is None else eyes
-    found = obstacles_around(7, pose, points, seen_from, np.full(len(points), age_s))
+    is_free = np.isin(np.arange(N_SECTORS), free)
+    found = obstacles_around(7, pose, points, is_free)
     assert found.distances_cm.shape == (72,)
     return {i: int(d) for i, d in enumerate(found.distances_cm) if d != UNKNOWN_CM}
 
@@ -105,38 +98,17 @@ def test_the_vehicle_itself_is_no_obstacle() -> None:
     assert distances(vehicle(0), at(40, 0.4)) == {8: pytest.approx(40, abs=3)}
 
 
-def test_free_requires_a_line_of_sight() -> None:
-    """A far wall ahead, seen from here; a far one to the side, seen from elsewhere."""
-    ahead, aside = at(20, 40.0), at(110, 40.0)
-    eyes = np.concatenate(
-        [np.broadcast_to(PLACE, ahead.shape), np.broadcast_to(PLACE + [30.0, 0, 0], aside.shape)]
-    )
-    assert distances(vehicle(20), np.concatenate([ahead, aside]), eyes) == {0: FREE}
+def test_an_obstacle_where_it_should_be_free() -> None:
+    found = distances(vehicle(0), at(0, 10.0), free=(0, 1))
+    assert found == {0: pytest.approx(1000, abs=4), 1: FREE}
 
 
-def test_line_of_sight_from_behind_counts() -> None:
-    """In forward flight the keyframe is behind, and its view passed through here."""
-    wall = at(0, 40.0)
-    behind = np.broadcast_to(PLACE - [15.0, 0.3, 0.1], wall.shape)
-    beyond = np.broadcast_to(PLACE + [15.0, 0.0, 0.0], wall.shape)
-    assert distances(vehicle(0), wall, behind) == {0: FREE}
-    assert distances(vehicle(0), wall, beyond) == {}
-
-
-def test_nadir_view_frees_nothing() -> None:
-    assert distances(vehicle(0), at(0, 40.0, down_m=12.0)) == {}
-
-
-def test_free_space_turns_to_unknown_and_an_obstacle_stays() -> None:
-    """As over one spot, where depth learns nothing new."""
-    both = np.concatenate([at(0, 40.0), at(90, 10.0)])
-    assert set(distances(vehicle(0), both, age_s=FREE_S)) == {0, 18}
-    assert set(distances(vehicle(0), both, age_s=FREE_S + 0.1)) == {18}
-
-
-def test_obstacle_in_front_of_free_space() -> None:
-    found = distances(vehicle(0), np.concatenate([at(0, 40.0), at(0, 10.0)]))
-    assert found == {0: pytest.approx(1000, abs=4)}
+def test_what_is_beyond_the_reach_is_not_told() -> None:
+    points = np.concatenate([at(0, 7.0), at(40, 9.0)])
+    is_free = np.isin(np.arange(N_SECTORS), 8)
+    found = obstacles_around(7, vehicle(0), points, is_free, 8.0)
+    assert found.max_cm == 800 and found.distances_cm[8] == 801
+    assert found.distances_cm[0] == pytest.approx(700, abs=4)
 
 
 def test_nan_points_are_ignored() -> None:
@@ -147,10 +119,8 @@ def test_nan_points_are_ignored() -> None:
 
 
 def test_message_is_as_autopilots_read_it() -> None:
-    points = np.concatenate([at(170, 8.0), at(130, 40.0)])
-    pose = vehicle(130)
-    eyes = np.broadcast_to(PLACE, points.shape)
-    found = obstacles_around(1_790_000_000_123_456_789, pose, points, eyes, np.zeros(len(points)))
+    is_free = np.isin(np.arange(N_SECTORS), 0)
+    found = obstacles_around(1_790_000_000_123_456_789, vehicle(130), at(170, 8.0), is_free)
     link = mavlink.MAVLink(None, 1, 197)
     message = link.parse_buffer(obstacle_distance(found).pack(link))[0]
     assert message.get_type() == "OBSTACLE_DISTANCE"
@@ -196,13 +166,10 @@ def test_recent_cloud_follows_map_updates() -> None:
     assert placed is not None
     camera = update.map_from_camera[5]
     wanted = 4.0 * (0.5 * points @ camera.rotation.T + camera.translation) @ turn.T + PLACE
-    np.testing.assert_allclose(placed[0], wanted, atol=1e-9)
-    eye = 4.0 * turn @ camera.translation + PLACE
-    np.testing.assert_allclose(placed[1], [eye, eye], atol=1e-9)
-    np.testing.assert_allclose(placed[2], [5.0, 5.0])
+    np.testing.assert_allclose(placed, wanted, atol=1e-9)
     old = cloud.in_world(111 * 10**9, update)
     assert old is not None
-    assert len(old[0]) == 0
+    assert len(old) == 0
 
 
 def test_without_a_scale_there_are_no_distances() -> None:
@@ -222,5 +189,5 @@ def test_recent_cloud_is_bounded() -> None:
         cloud.add(chunk(i, 100 + i, np.full((1050, 3), float(i))))
     placed = cloud.in_world(110 * 10**9, update)
     assert placed is not None
-    assert sorted(set(placed[0][:, 0])) == [7, 8, 9]
-    assert len(placed[0]) <= 300
+    assert sorted(set(placed[:, 0])) == [7, 8, 9]
+    assert len(placed) <= 300

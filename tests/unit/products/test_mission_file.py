@@ -37,7 +37,7 @@ def test_the_path_of_a_flight_and_the_way_back(
     words = ["flights", "mission", run.name, "--flights", str(run.parent), "--out", str(out)]
     assert main([*words, *["--back"] * back]) == 0
     said = capsys.readouterr().out
-    assert "waypoints" in said and "placed within 1.5 m" in said
+    assert "waypoints" in said and "placed within 1.6 m" in said
     poses, origin, _ = read_path(run)
     assert origin is not None
     path = np.stack([p.world_from_camera.translation for p in poses])

@@ -1,0 +1,131 @@
+"""Obstacles around the vehicle now, of tracks, images, the map, and depth.
+
+Depth of a keyframe comes a second or two late. What is told is confirmed by the newest images.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from companion.dense.clear_sight import free_sectors
+from companion.dense.fresh_sight import points_found, sectors_seen
+from companion.dense.newest_sight import NewestSight, Seen, things_in
+from companion.dense.obstacles import (
+    FREE_M,
+    MIN_POINTS,
+    N_SECTORS,
+    Obstacles,
+    RecentCloud,
+    known_in,
+    obstacles_around,
+    sector_of,
+)
+from companion.dense.sight_tracks import WINDOW_PX
+from companion.geometry.camera import Camera
+from companion.messages import Bytes, DepthMap, Frame, MapUpdate, PointChunk, Track, TrackState
+
+MAX_AGE_NS = 200_000_000
+"""Age of the image that the pose is from, and of that in which a sector was seen, since exposure;
+beyond it nothing is known: at 5 m/s all distances are a metre off."""
+MOST_TRACKS = 16
+"""Frames within that age, and more at 60 a second: every other is then enough."""
+MOST_WAITING = 4
+"""Depth maps and chunks between two rounds; of more the newest count. One takes a megabyte."""
+
+
+class ObstacleFinder:
+    """Obstacles of what is known of one map.
+
+    Frames, what else is taken, and rounds may come in three threads.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._track: Track | None = None
+        self._tracks: deque[Track] = deque(maxlen=MOST_TRACKS)
+        """The newest that found map points."""
+        self._map: MapUpdate | None = None
+        self._cloud = RecentCloud()
+        self._waiting: deque[DepthMap | PointChunk] = deque(maxlen=MOST_WAITING)
+        """To be added by the next round to the cloud, which is its thread's alone."""
+        self._sight = NewestSight(camera)
+        self._greys: deque[tuple[int, Bytes]] = deque(maxlen=MOST_TRACKS)
+        """The newest images by their numbers: of one its track comes some images later."""
+        self._sighted = -1
+
+    def take(self, message: Track | MapUpdate | DepthMap | PointChunk) -> None:
+        """Take a track, a map update, a depth map or points."""
+        if isinstance(message, Track):
+            self._track = message
+            if message.keypoints_px is not None and not message.backfilled:
+                self._tracks.append(message)
+        elif isinstance(message, MapUpdate):
+            self._map = message
+        else:
+            self._waiting.append(message)
+
+    def frame(self, frame: Frame) -> None:
+        """Take a frame."""
+        self._greys.append((frame.seq, frame.grey))
+
+    def obstacles(self, now_ns: int, reach_m: float) -> Obstacles | None:
+        """Obstacles by the map's own pose; None while that is unknown or old.
+
+        Known are sectors alone in which one of the newest frames has found points of the map.
+        """
+        track, tracks, update = self._track, list(self._tracks), self._map
+        while self._waiting:
+            message = self._waiting.popleft()
+            if isinstance(message, DepthMap):
+                self._cloud.add_map(message)
+            else:
+                self._cloud.add(message)
+        if (
+            track is None or track.state is not TrackState.TRACKING
+            or track.map_from_camera is None or now_ns - track.t_ns > MAX_AGE_NS
+            or update is None or update.georeference is None
+        ):  # fmt: skip
+            return None
+        points = self._cloud.in_world(now_ns, update)
+        if points is None:
+            return None
+        world_from_map = update.georeference.world_from_map
+        world_from_body = (
+            world_from_map.apply_to_pose(track.map_from_camera) @ self._camera.camera_from_body
+        )
+        is_seen = np.zeros(N_SECTORS, bool)
+        for each in tracks:
+            pose = each.map_from_camera
+            if pose is None or each.keypoints_px is None or now_ns - each.t_ns > MAX_AGE_NS:
+                continue
+            is_seen |= sectors_seen(
+                each.keypoints_px, world_from_map.apply_to_pose(pose), world_from_body, self._camera
+            )
+            if each is track:
+                found = points_found(update.points_map, each.keypoints_px, pose, self._camera)
+                points = np.concatenate([points, world_from_map.apply(found)])
+        is_free = np.zeros(N_SECTORS, bool)
+        newest = self._newest_sight(track, update)
+        if newest is not None and now_ns - newest.t_ns <= MAX_AGE_NS:
+            window_rad = WINDOW_PX / self._camera.fx
+            things = things_in(newest, 0.5 * window_rad)
+            points = np.concatenate([points, things])
+            around = sector_of(things - world_from_body.translation, world_from_body)
+            is_seen |= np.bincount(around, minlength=N_SECTORS) >= MIN_POINTS
+            if reach_m <= FREE_M:
+                is_free = free_sectors(newest, world_from_body, window_rad)
+        return known_in(
+            obstacles_around(track.t_ns, world_from_body, points, is_free, reach_m),
+            is_seen | is_free,
+        )
+
+    def _newest_sight(self, track: Track, update: MapUpdate) -> Seen | None:
+        """Points of the newest image whose track has come."""
+        sight = self._sight
+        grey = next((grey for seq, grey in list(self._greys) if seq == track.seq), None)
+        if grey is not None and track.seq != self._sighted:
+            self._sighted = track.seq
+            sight.add(track, grey, update)
+        return sight.newest

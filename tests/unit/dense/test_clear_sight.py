@@ -1,0 +1,137 @@
+"""Sectors that are free: nothing of a stated size can stand in them unseen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from companion.dense.clear_sight import THING_M, free_sectors
+from companion.dense.newest_sight import Seen
+from companion.dense.obstacles import FREE_M
+from companion.dense.sight_tracks import WINDOW_PX
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Array, Pose
+from tests.support.flights.approach_scene import ApproachScene, Sheet
+from tests.unit.dense.test_newest_sight import AHEAD, SCENE, looked
+
+EYE = np.array([3.0, -4.0, -10.0])
+HERE = Pose(np.eye(3), EYE)
+WINDOW_RAD = 9 / 500
+NARROW = Camera(320, 290, 500.0, 500.0, 159.5, 144.5, body_from_camera=AHEAD)
+"""Sees all heights that are asked for, and the sectors from -3 to 3."""
+
+
+def corners(away_m: float = 30.0, sigma: float = 0.002, apart_deg: float = 1.0) -> Seen:
+    """A level view to the north, 60 degrees wide, with a corner at each degree of a far surface."""
+    east, up = np.meshgrid(np.arange(-30, 30, apart_deg), np.arange(-18, 19, apart_deg))
+    east, up = np.radians(east.ravel()), np.radians(up.ravel())
+    rays = np.stack([np.ones(east.shape), np.tan(east), -np.tan(up) / np.cos(east)], 1)
+    inverse_m = np.full(len(rays), 1.0 / away_m)
+    sigmas = np.full(len(rays), sigma)
+    return Seen(0, EYE, rays, inverse_m, sigmas, inverse_m + 2 * sigmas)
+
+
+def kept(seen: Seen, mask: Array) -> Seen:
+    return Seen(
+        seen.t_ns, EYE, seen.rays_world[mask], seen.inverse_m[mask], seen.sigma[mask],
+        seen.most_inverse_m[mask],
+    )  # fmt: skip
+
+
+def free(seen: Seen) -> set[int]:
+    """Sectors, those to the left below zero."""
+    found = np.flatnonzero(free_sectors(seen, HERE, WINDOW_RAD))
+    return {int(sector - 72 if sector > 36 else sector) for sector in found}
+
+
+def angles_deg(seen: Seen) -> tuple[Array, Array]:
+    """Bearing and elevation."""
+    x, y, z = seen.rays_world.T
+    return np.degrees(np.arctan2(y, x)), np.degrees(np.arctan2(-z, np.hypot(x, y)))
+
+
+def test_a_far_surface_shows_that_what_is_before_it_is_free() -> None:
+    assert free(corners()) == set(range(-5, 6))
+    assert free(corners(away_m=FREE_M + 1.0, sigma=0.001)) == set(range(-5, 6))
+    assert free(corners(away_m=FREE_M - 0.5)) == set()
+
+
+def test_sectors_turn_with_the_vehicle() -> None:
+    to_the_right = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    found = free_sectors(corners(), Pose(to_the_right, EYE), WINDOW_RAD)
+    assert set(np.flatnonzero(found)) == set(range(72 - 18 - 5, 72 - 18 + 6))
+
+
+def test_without_parallax_nothing_is_free() -> None:
+    """As over one spot: all looks as if it were far away, and might be near."""
+    assert free(corners(away_m=1e6, sigma=0.07)) == set()
+
+
+@pytest.mark.parametrize("at_deg", [(0.0, 0.0), (11.0, 9.0), (-14.5, -8.0)])
+def test_a_thing_without_corners_leaves_its_sectors_unknown(at_deg: tuple[float, float]) -> None:
+    """By its edges corners of what is behind are followed, half a window into it."""
+    seen = corners()
+    bearing, up = angles_deg(seen)
+    half = np.degrees(0.5 * (THING_M / FREE_M - WINDOW_RAD))
+    hidden = (np.abs(bearing - at_deg[0]) <= half) & (np.abs(up - at_deg[1]) <= half)
+    about = round(at_deg[0] / 5)
+    left = free(kept(seen, ~hidden))
+    assert about not in left
+    assert left >= set(range(-5, 6)) - {about - 1, about, about + 1}
+
+
+def test_too_few_corners_show_nothing() -> None:
+    assert free(corners(apart_deg=4.0)) == set()
+
+
+@pytest.mark.parametrize("away_m", [3.0, 8.4])
+def test_a_corner_in_front_speaks_against_all_about_it(away_m: float) -> None:
+    """What is measured just behind may be just in front."""
+    seen = corners()
+    bearing, up = angles_deg(seen)
+    n = int(np.argmin((bearing - 13.0) ** 2 + (up - 2.0) ** 2))
+    near = seen.inverse_m.copy()
+    near[n] = 1.0 / away_m
+    found = free(replace(seen, inverse_m=near, most_inverse_m=near + 0.01))
+    assert found == set(range(-5, 6)) - {2, 3}
+
+
+def test_ground_below_the_band_is_no_obstacle() -> None:
+    """As seen from two metres: it is where it was measured, under what the vehicle flies through;
+    from half a metre it is in its way."""
+    seen = corners()
+    _, up = angles_deg(seen)
+    for height_m, wanted in ((2.0, set(range(-5, 6))), (0.5, set())):
+        slope = np.tan(np.radians(-up)) * np.hypot(*seen.rays_world[:, :2].T)
+        inverse_m = np.where(up < -1e-9, np.maximum(slope / height_m, 1 / 30), 1 / 30)
+        found = free(replace(seen, inverse_m=inverse_m, most_inverse_m=inverse_m + 0.004))
+        assert found == wanted
+
+
+def test_a_far_wall_is_free_before_it_and_a_pole_is_not() -> None:
+    seen = looked(lambda n: np.array([0.0, 0.05 * n - 0.55, -3.0]), 0.02, NARROW)
+    assert seen is not None
+    window_rad = WINDOW_PX / NARROW.fx
+    found = free_sectors(seen, Pose(np.eye(3), seen.eye_world_m), window_rad)
+    assert found[[-2, -1, 0]].all()
+    assert not found[1] and not found[2]  # the pole, 15 cm thick to either side
+    assert found.sum() <= 5
+
+
+def test_one_that_hovers_sees_nothing_free() -> None:
+    """Though by its poses it has moved by centimetres."""
+    seen = looked(lambda n: np.array([0.0, 0.0, -3.0]), 0.02, NARROW)
+    assert seen is not None and len(seen.rays_world) > 100
+    assert not free_sectors(seen, Pose(np.eye(3), seen.eye_world_m), WINDOW_RAD).any()
+
+
+def test_open_country_is_free_below_the_sky_and_a_pole_before_it_is_not() -> None:
+    hedge = Sheet(np.array([30.0, -40, -4]), np.array([0, 80.0, 0]), np.array([0, 0, 4.0]), 2)
+    country = ApproachScene([*SCENE.things[:1], hedge, *SCENE.things[2:]], 0.06)
+    seen = looked(lambda n: np.array([0.0, 0.08 * n - 0.88, -3.0]), 0.02, NARROW, country)
+    assert seen is not None
+    found = free_sectors(seen, Pose(np.eye(3), seen.eye_world_m), WINDOW_PX / NARROW.fx)
+    assert found[[-2, -1, 0]].all()
+    assert not found[1] and not found[2]
