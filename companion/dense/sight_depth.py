@@ -88,17 +88,19 @@ def sight_depth(seen: Array, world_from_camera: list[Pose], focal_px: float) -> 
 
 def _estimate(rays: Array, before: Array, earlier: _Earlier) -> _Estimate:
     """Inverse depth along rays (N, 3), by least squares along the epipolar lines of (K, N, 2)."""
-    turned = rays @ earlier.rotations.transpose(0, 2, 1)
-    t = earlier.places[:, None]
-    # a point at inverse depth rho moves by rho times the slope
-    moved = before - turned[..., :2] / turned[..., 2:]
-    slope = (t[..., :2] - before * t[..., 2:]) / turned[..., 2:]
-    known = ~np.isnan(before[..., 0])
-    moved[~known] = slope[~known] = 0.0
-    along = (slope**2).sum(2)
-    rho = (moved * slope).sum((0, 2)) / np.maximum(along.sum(0), 1e-12)
+    x, y, z = (rays @ earlier.rotations.transpose(0, 2, 1)).transpose(2, 0, 1)
+    tx, ty, tz = earlier.places.T[..., None]
+    u, v = before[..., 0], before[..., 1]
+    known = ~np.isnan(u)
+    # by how much each has moved, and by how much it does for inverse depth 1
+    dx, dy = np.where(known, u - x / z, 0.0), np.where(known, v - y / z, 0.0)
+    sx, sy = np.where(known, (tx - u * tz) / z, 0.0), np.where(known, (ty - v * tz) / z, 0.0)
+    along = sx * sx + sy * sy
+    all_along = np.maximum(along.sum(0), 1e-12)
+    rho = (dx * sx + dy * sy).sum(0) / all_along
     n_images = known.sum(0)
-    rms = np.sqrt(((moved - rho[:, None] * slope) ** 2).sum((0, 2)) / np.maximum(n_images, 1))
+    rest = (dx * dx + dy * dy).sum(0) - rho**2 * all_along
+    rms = np.sqrt(np.maximum(rest, 0.0) / np.maximum(n_images, 1))
     longest = along.argmax(0)
     lever = np.sqrt(np.maximum(along.max(0), 1e-18))
     way = np.linalg.norm(earlier.places, axis=1)[longest]
