@@ -109,7 +109,7 @@ class FeedbackConfig:
     """Send the flow of the ground from the first two frames on, without any scale: OPTICAL_FLOW
     for ArduPilot, OPTICAL_FLOW_RAD for PX4."""
     obstacle_distance: bool = False
-    """Send OBSTACLE_DISTANCE from the newest part of the cloud."""
+    """Send OBSTACLE_DISTANCE: what stands around the vehicle by the newest images and depths."""
 
     @property
     def sends_position(self) -> bool:
