@@ -34,10 +34,9 @@ def sky_rays(
     Of each column it is what is plain from above on, and ends no farther than `near_by_rad` from
     pixels (K, 2) of something far, and farther than that from those of anything near.
     """
-    nothing = np.zeros((0, 3))
     upright = world_from_camera.rotation[2, 1]
-    if abs(upright) < UPRIGHT:
-        return nothing
+    if abs(upright) < UPRIGHT or len(far_px) == 0:
+        return np.zeros((0, 3))
     height, width = grey.shape[0] // COARSE, grey.shape[1] // COARSE
     small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
     around = np.ones((3, 3), np.uint8)
@@ -51,9 +50,10 @@ def sky_rays(
     found = np.zeros(small.shape, bool)
     least = camera.fx * MIN_WIDTH_RAD / COARSE
     _, which, stats, _ = cv2.connectedComponentsWithStats(above.astype(np.uint8), connectivity=4)
+    rest = small[order][~above]
     for each in np.flatnonzero(stats[1:, cv2.CC_STAT_WIDTH] >= least) + 1:
         inside = which == each
-        if small[order][inside].mean() >= small[order][~above].mean():
+        if len(rest) and small[order][inside].mean() >= rest.mean():
             found |= inside & ends_far
     v, u = np.nonzero(found[order][::2, ::2])
     pixels = 2.0 * COARSE * np.stack([u, v], 1) + 0.5 * (COARSE - 1)

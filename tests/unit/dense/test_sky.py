@@ -75,6 +75,10 @@ def test_over_what_is_not_known_to_be_far_is_none() -> None:
     assert len(u) > 800 and u.max() < 345
 
 
+def test_a_picture_of_nothing_has_none() -> None:
+    assert len(seen(np.full((480, 640), 200, np.uint8), corners())[0]) == 0
+
+
 def test_what_is_darker_than_the_land_is_none() -> None:
     grey = picture()
     grey[:HORIZON] -= 130
