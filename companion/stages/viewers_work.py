@@ -21,7 +21,7 @@ from companion.timing.clock import monotonic_s, wait_s
 OWN = "127.0.0.1:0"
 """Address for viewers of this machine, on a port of their own."""
 PATH_STEP_NS = 200_000_000
-BIND_AGAIN_S, HELD_BY_OURS = 1.0, 10
+BIND_AGAIN_S, HELD_BY_OURS = 1.0, 4
 """Interval of attempts to have the port, and how many fail before that is told: the flight before
 may still have it while it gives its last results."""
 DRAIN_S, DRAIN_TICK_S = 2.5, 0.02
