@@ -14,6 +14,7 @@ os.environ["NUMBA_CPU_FEATURES"] = ""
 
 import importlib
 import pkgutil
+import shutil
 
 from companion.slam import compiled
 from companion.slam.compiled import shipped_code
@@ -21,6 +22,7 @@ from companion.slam.compiled import shipped_code
 
 def main() -> int:
     """Write the code of all loops beside them; the exit status."""
+    shutil.rmtree(shipped_code.FOLDER, ignore_errors=True)  # what is loaded cannot be written
     from companion.slam.compiled.compiling import HERE, code_of_loops
 
     for module in pkgutil.iter_modules(compiled.__path__):
