@@ -90,9 +90,6 @@ class Daemon:
             lambda why: self._on_warned(Warned(clock.now_ns(), NOT_KEPT, why)), self._reconfigured,
         )  # fmt: skip
         config = settings.config
-        belief = belief_in_words(config.telemetry.use)
-        if belief:
-            journal.say(belief, WARNING)
         self._service = ServiceManager()
         self._loop_delay = LatencyMeter()
         self._overdue = OverdueFrames()
@@ -161,7 +158,10 @@ class Daemon:
         loop.add_signal_handler(signal.SIGTERM, self._stop.stop)
         loop.add_signal_handler(signal.SIGHUP, self._checks.reload)
         socket = StatusSocket(own_socket_path(config.daemon.socket), self._status, self._problem)
-        await socket.start()
+        await socket.start()  # a second daemon ends here, and says nothing else
+        self._settings.say_resumed()
+        if belief := belief_in_words(config.telemetry.use):
+            self._journal.say(belief, WARNING)
         parts: list[StatusSocket | Metrics] = [socket]
         if config.daemon.prometheus_port:
             parts.append(self._metrics(config.daemon.prometheus_port))

@@ -113,6 +113,8 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
             ).stdout  # fmt: skip
             with urllib.request.urlopen(f"http://127.0.0.1:{metrics_port}/metrics") as answer:
                 out.metrics = answer.read().decode()
+            with Daemon(folder, *settings) as second:  # with the socket of the first, and armed
+                out.second = second.ended(60)
             wait_until(DISARMS_S)
             autopilot.disarm()
             out.disarmed_ns = time.monotonic_ns()
@@ -124,8 +126,6 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
             out.crowding += strain.withheld_s(begins_ns, now_ns) / (1e-9 * (now_ns - begins_ns))
             # scale, and one second of proof
             out.first_pose_allowed_s = strain.allowed_s(12.0, out.armed_ns)
-            with Daemon(folder, *settings) as second:  # with the socket of the first
-                out.second = second.ended(60)
             told_ns = time.monotonic_ns()
             out.stop_s = daemon.stop()
             out.stop_allowed_s = strain.allowed_s(STOP_S, told_ns)
@@ -235,7 +235,11 @@ def test_results_are_left(flown: Flown) -> None:
     assert result.n_common > 0.7 / flown.crowding * len(TRUTH.t_s)
     assert result.ate_sim3_m < 0.5
     assert result.scale_error < 0.03
-    assert len(read_ply(flown.folder / "cloud.ply")) > 1000
+    n_points = len(read_ply(flown.folder / "cloud.ply"))
+    gave_way = [line for line in flown.lines if "dense map off" in line]
+    print(f"{n_points} points", gave_way)
+    # the dense map gives way to the pose where there is no processor for both, and says so
+    assert n_points > 1000 or (flown.crowding > 2 and gave_way)
 
 
 def test_only_one_daemon(flown: Flown) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from companion.config import Config
 from companion.config_file import value_of_key, with_values
-from companion.daemon.control.armed_settings import FILE, read_settings
+from companion.daemon.control.armed_settings import FILE, Resumed, read_settings
 from companion.daemon.control.arming import Arming
 from companion.daemon.control.kept_settings import kept_over
 from companion.daemon.control.reload import reloaded
@@ -51,8 +51,12 @@ class SettingsInForce:
         """Values set from the ground, by key; changed in place."""
         self._stays_off = resumed.by_ground.get("feedback.mode") == "off"
         """True until the pilot was told, over the open link, that poses stay off."""
-        if before is not None:
-            self._say_resumed(resumed.by_ground, resumed.waiting, unreadable)
+        self._resumed = "" if before is None else _resumed_text(resumed, unreadable)
+
+    def say_resumed(self) -> None:
+        """Report what a daemon that ended while armed has left, if one has."""
+        if self._resumed:
+            self._journal.say(self._resumed, WARNING)
 
     @property
     def armed(self) -> bool:
@@ -136,14 +140,13 @@ class SettingsInForce:
             self._tell_pilot(POSITION_ENABLED())
         self.take_over(with_values(self.config, waiting))
 
-    def _say_resumed(
-        self, by_ground: Mapping[str, Any], waiting: Mapping[str, Any], unreadable: str
-    ) -> None:
-        text = "the daemon before ended while armed; until disarmed what counted then counts"
-        if unreadable:
-            text += f", which cannot be read, so that no pose is sent ({unreadable})"
-        else:
-            text += "".join(f"; {k} = {v} (by the ground)" for k, v in by_ground.items())
-        if waiting:
-            text += f"; these wait for disarming: {', '.join(waiting)}"
-        self._journal.say(text, WARNING)
+
+def _resumed_text(resumed: Resumed, unreadable: str) -> str:
+    text = "the daemon before ended while armed; until disarmed what counted then counts"
+    if unreadable:
+        text += f", which cannot be read, so that no pose is sent ({unreadable})"
+    else:
+        text += "".join(f"; {k} = {v} (by the ground)" for k, v in resumed.by_ground.items())
+    if resumed.waiting:
+        text += f"; these wait for disarming: {', '.join(resumed.waiting)}"
+    return text

@@ -270,7 +270,7 @@ def test_a_recorded_flight_gives_the_samples_that_its_log_gives() -> None:
             continue
         same = [
             each for each in in_log
-            if abs(each.t_ns - t_ns) < 100_000_000 and _same(each, sample, apart_m)
+            if abs(each.t_ns - t_ns) < SECOND and _same(each, sample, apart_m)
         ]  # fmt: skip
         assert same, sample
         if isinstance(sample, AttitudeSample):
