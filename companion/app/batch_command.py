@@ -82,12 +82,14 @@ def batch(
 def replay_one(name: str, flight: Path, out: Path, config: Config, mark: str) -> BatchResult:
     """One Dask task. An error of the flight ends that flight only."""
     folder = out / name
+    for left in (DONE, REPORT):  # of a replay with other settings
+        (folder / left).unlink(missing_ok=True)
     try:
         given = RecordedInput(flight, config)
         replay(given, folder, config, "none", Progress(), lambda remark: None)
         write_atomically(folder / THUMBNAIL, thumbnail(flight, config.camera))
     except (CompanionError, OSError) as error:
-        return BatchResult(name, flight, str(error), {})
+        return BatchResult(name, flight, str(error), _object(folder / REPORT) or {})
     except Exception as error:  # a bug that one flight brings out must not cost the others
         return BatchResult(name, flight, f"{type(error).__name__}: {error}", {})
     write_atomically(folder / DONE, json.dumps({"mark": mark}).encode())

@@ -56,7 +56,7 @@ from companion.timing.clock import FlightClock
 from companion.timing.overdue_frames import OVERDUE_NS, OverdueFrames
 from drivers.camera.camera_feed import CameraFeed
 from drivers.camera.camera_registry import camera_source
-from drivers.camera.live_calibration import is_on_gimbal
+from drivers.camera.live_calibration import check_calibration, is_on_gimbal
 from drivers.mavlink.autopilot_date import AutopilotDate
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.origin_keeper import OriginKeeper
@@ -90,6 +90,7 @@ class Daemon:
             lambda why: self._on_warned(Warned(clock.now_ns(), NOT_KEPT, why)), self._reconfigured,
         )  # fmt: skip
         config = settings.config
+        check_calibration(config.camera, config.mount)
         self._service = ServiceManager()
         self._loop_delay = LatencyMeter()
         self._overdue = OverdueFrames()

@@ -16,6 +16,7 @@ from drivers.images.calibration_file import (
     assumed_camera,
     configured_rotation,
     read_calibration,
+    stated_size,
     states_gimbal,
     with_mount,
     with_readout,
@@ -61,6 +62,14 @@ def live_camera(
             "be used; set [mount]"
         )
     return with_readout(camera, config.readout_ms), warnings
+
+
+def check_calibration(config: CameraConfig, mount: MountConfig) -> None:
+    """Raise what `live_camera` will for pictures of any size, before there is a camera."""
+    file = _calibration_file(config)
+    if file is not None:
+        width, height = stated_size(file)
+        live_camera(config, mount, int(width), int(height))
 
 
 def is_on_gimbal(config: CameraConfig, mount: MountConfig) -> bool:

@@ -53,7 +53,7 @@ def read_calibration(path: Path, width: int, height: int) -> Camera:
     be left out.
     """
     content = _content(path)
-    size = tuple(_number(path, content, key) for key in ("width", "height"))
+    size = _size(path, content)
     if size != (width, height):
         raise FlightError(
             f"{path}: it is for pictures of {size[0]:g} x {size[1]:g}, those that come are "
@@ -70,6 +70,11 @@ def read_calibration(path: Path, width: int, height: int) -> Camera:
         body_from_camera_of(path, content.get("body_from_camera")), content.get("assumed") is True,
         _readout_ms(path, content), _gimbal(path, content),
     )  # fmt: skip
+
+
+def stated_size(path: Path) -> tuple[float, float]:
+    """Width and height of the pictures that a calibration is for; FlightError if unreadable."""
+    return _size(path, _content(path))
 
 
 def states_gimbal(path: Path) -> bool:
@@ -149,6 +154,10 @@ def _content(path: Path) -> Mapping[str, Any]:
     if not isinstance(content, dict):
         raise FlightError(f"{path}: wanted an object with keys fx, fy, cx, cy and so on")
     return content
+
+
+def _size(path: Path, content: Mapping[str, Any]) -> tuple[float, float]:
+    return _number(path, content, "width"), _number(path, content, "height")
 
 
 def _number(path: Path, content: Mapping[str, Any], key: str) -> float:

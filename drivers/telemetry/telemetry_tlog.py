@@ -19,7 +19,7 @@ from companion.geometry.geodesy import GeoOrigin
 from companion.messages import Warned
 from companion.telemetry import ArmedSample, LandedSample, Telemetry
 from companion.timing.log_clock import BootSegments, estimate_clock
-from companion.timing.stamp_filter import valid_stamps
+from companion.timing.stamp_filter import steps_ahead_ns, valid_stamps
 from drivers.telemetry.gimbal_messages import GIMBAL_IDS, GimbalChoice, gimbal_of, is_stamped
 from drivers.telemetry.mavlink_samples import (
     ATTITUDE_IDS,
@@ -36,6 +36,7 @@ AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 MAX_ROUND_TRIP_NS = 2_000_000_000
 BACK_US = 500_000
 """Records of several links are written by less out of order than this."""
+SET = "the computer's clock was set meanwhile, and the autopilot's is not put on it well"
 
 
 def read_tlog(path: Path) -> LogContent:
@@ -54,10 +55,7 @@ def read_tlog(path: Path) -> LogContent:
     steps_us = [before.unix_us - after.unix_us for before, after in pairwise(records)]
     back_us = [step for step in steps_us if step > BACK_US]
     if back_us:
-        detail = (
-            f"{len(back_us)} x in {path.name}, by {max(back_us) * 1e-6:.1f} s at most: the clock "
-            "of the computer was set while it recorded, and the autopilot's is not put on it well"
-        )
+        detail = f"{len(back_us)} x in {path.name}, by {max(back_us) * 1e-6:.1f} s at most: {SET}"
         warnings.append(Warned(first_ns, "the log's time goes back", detail))
     vehicle, n_vehicles = _vehicle(records)
     if vehicle is None:
@@ -106,6 +104,11 @@ class _Reader:
         for record in mine:
             if record.message_id in chosen:
                 self._take(record)
+        ahead_ns = steps_ahead_ns(self._one_way)
+        if ahead_ns:
+            by = f"{len(ahead_ns)} x in {self._collected.source}, by {max(ahead_ns) * 1e-9:.1f} s"
+            detail = f"{by} at most: {SET}, unless the autopilot's stood still"
+            warnings.append(Warned(records[0].unix_us * 1000, "the log's time goes ahead", detail))
         clock = estimate_clock(self._exchanges, self._one_way)
         return LogContent(
             self._collected,

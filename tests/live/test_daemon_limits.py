@@ -38,6 +38,15 @@ def test_a_device_for_the_depth_that_there_is_not(tmp_path: Path) -> None:
     assert "no such device" in line and "opencl.device" in line
 
 
+def test_a_wrong_calibration_is_told_before_there_is_a_camera(tmp_path: Path) -> None:
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("width = 640\nheight = 480\n")
+    url = f"camera.url=http://127.0.0.1:{free_port()}/stream"
+    settings = ("camera.source=network", url, f"camera.calibration={wrong}", NO_DEPTH)
+    with Daemon(tmp_path, *settings) as daemon:
+        assert "wrong.toml: the key fx is missing" in refused(daemon.ended(60))
+
+
 @pytest.mark.parametrize("missing", ["camera", "autopilot"])
 def test_a_device_that_stays_missing_ends_it(tmp_path: Path, missing: str) -> None:
     there = {

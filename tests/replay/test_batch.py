@@ -25,19 +25,24 @@ def test_an_archive_is_replayed_once_and_shown_on_one_page(tmp_path: Path) -> No
     record(tmp_path / FIRST, 12)
     record(tmp_path / SECOND, 12, "raw")
     (tmp_path / "empty").mkdir()
-    flights = [tmp_path / FIRST, tmp_path / SECOND / "flight.mcap", tmp_path / "empty"]
+    record(tmp_path / "short", 2)
+    flights = [tmp_path / FIRST, tmp_path / SECOND / "flight.mcap"]
+    flights += [tmp_path / "empty", tmp_path / "short"]
     out = tmp_path / "out"
     settings = "--out", out, "--workers", 2, "--set", "depth.enabled=false"
     done = batch(*flights, *settings)
     assert done.returncode == 1
     lines = done.stderr.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("companion: empty: "), done.stderr
-    assert "3 flights, 0 done before, 1 failed" in done.stdout
+    assert len(lines) == 2 and lines[0].startswith("companion: empty: "), done.stderr
+    assert lines[1].startswith("companion: short: no map: "), done.stderr
+    assert "4 flights, 0 done before, 2 failed" in done.stdout
     for name in (FIRST, SECOND):
         assert json.loads((out / name / "report.json").read_text())["frames"] == 12
     page = (out / "index.html").read_text()
     assert page.count("data:image/jpeg;base64,") == 2
     assert f'href="{FIRST}/report.html"' in page and "no video and no images" in page
+    assert 'href="short/report.html"' in page and (out / "short" / "report.html").is_file()
+    assert 'href="empty/' not in page
 
     stamps = [(out / name / "report.json").stat().st_mtime_ns for name in (FIRST, SECOND)]
     record(tmp_path / "other" / SECOND, 10)

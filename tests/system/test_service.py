@@ -50,6 +50,7 @@ WantedBy=multi-user.target
 """
 
 pytestmark = [
+    pytest.mark.continues,
     pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT),
     pytest.mark.timeout(1200),
 ]
@@ -194,6 +195,22 @@ def test_an_upgrade_keeps_the_configuration(container: Container, service: Boote
     service.until_flying()
     assert service.shown("MainPID") != pid
     assert (container.root / "etc/companion/companion.toml").read_text() == CONFIG
+
+
+def test_the_version_before_comes_back(container: Container, service: BootedService) -> None:
+    """By one command, and by itself where the updated one does not get ready."""
+    before, pid = recordings(container), service.shown("MainPID")
+    assert "is in place" in container.run("companion-back", "--armed")
+    until(lambda: service.shown("MainPID") not in (pid, "0"), "another start")
+    service.until_flying()
+    program = container.root / "opt/companion/bin/companion"
+    program.rename(program.with_name("gone"))
+    container.run("systemctl", "restart", "companion", check=False)
+    said = container.run("env", "PROOF_S=5", "companion-back", "--unless-ready")
+    assert "the version before comes back" in said and "is in place" in said
+    service.until_flying()
+    assert (container.root / "etc/companion/companion.toml").read_text() == CONFIG
+    assert set(before) <= set(recordings(container))
 
 
 def test_removed_it_leaves_what_is_the_owners_purged_nothing(

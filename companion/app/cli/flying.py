@@ -103,10 +103,12 @@ def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
 
 def _check_beyond(config: Config) -> None:
-    """Check what the settings name; ConfigError for a link that cannot be, a warning for files.
+    """Check what the settings name: ConfigError for a link that cannot be, a warning for no file.
 
-    The configuration may be for another computer, which has the files.
+    The configuration may be for another computer, which has the files. FlightError for a
+    calibration that is there and is none.
     """
+    from drivers.camera.live_calibration import check_calibration
     from drivers.mavlink.wire.link_url import client_endpoint, link_endpoint
 
     if config.link.url:
@@ -117,6 +119,8 @@ def _check_beyond(config: Config) -> None:
     for key, name in named.items():
         if name and not Path(name).exists():
             print(f"companion: warning: {key}: {name}: not there", file=sys.stderr)
+    if Path(config.camera.calibration).is_file():
+        check_calibration(config.camera, config.mount)
 
 
 COMMANDS: dict[str, Command] = {

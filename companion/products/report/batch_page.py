@@ -14,7 +14,7 @@ from companion.products.report.templates import rendered
 
 @dataclass(frozen=True, slots=True)
 class BatchResult:
-    """Outcome of one flight: `error`, or "" and the numbers of its `report`."""
+    """Outcome of one flight: `error` or "", and the numbers of its `report` where it has one."""
 
     name: str
     flight: Path
@@ -69,6 +69,7 @@ def _shown(row: BatchResult, picture: bytes) -> dict[str, Any]:
         "name": row.name,
         "flight": str(row.flight),
         "error": row.error,
+        "has_report": bool(report),
         "picture": base64.b64encode(picture).decode() if picture else "",
         "when": _when(report.get("first_unix_s")),
         "duration": f"{minutes}:{seconds:02d} min" if duration_s is not None else "",

@@ -56,6 +56,10 @@ def test_check_config_looks_beyond_the_words(tmp_path: Path) -> None:
     result = companion("check-config", "--set", f"camera.calibration={tmp_path / 'none.toml'}")
     assert result.returncode == 0  # it may be on the drone
     assert result.stderr.startswith("companion: warning: camera.calibration: ")
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("width = 640\nheight = 480\n")
+    line = refused(companion("check-config", "--set", f"camera.calibration={wrong}"))
+    assert line.endswith("wrong.toml: the key fx is missing")
 
 
 def test_help_of_export_names_every_format() -> None:

@@ -145,6 +145,17 @@ def test_a_clock_that_was_set_back_while_it_recorded_is_told(tmp_path: Path) -> 
     assert "1 x in telemetry.tlog, by 3.0 s" in told["the log's time goes back"]
 
 
+def test_a_clock_that_was_set_ahead_is_told_and_a_stalled_link_is_not(tmp_path: Path) -> None:
+    stalled, ahead = Tlog(flying(4.0).data), Tlog(flying(4.0).data)
+    for t_ns in range(4 * S, 20 * S, S // 50):
+        message = attitude(BOOT_NS + t_ns, ROLL, PITCH, YAW)
+        stalled.add(START_NS + max(t_ns, 7 * S), message)
+        ahead.add(START_NS + t_ns + 7200 * S, message)
+    assert read(tmp_path, stalled).warnings == ()
+    told = {warned.what: warned.detail for warned in read(tmp_path, ahead).warnings}
+    assert "1 x in telemetry.tlog, by 7200.0 s" in told["the log's time goes ahead"]
+
+
 def test_a_reboot(tmp_path: Path) -> None:
     log = flying()
     for t_ns in range(0, 5 * S, S // 50):
