@@ -17,11 +17,14 @@ from companion.slam.compiled.compiling import (
     integers,
     numbers,
     small_integer,
+    tiny_word,
 )
 
 Words = NDArray[np.uint32]
 Rows = NDArray[np.int32]
-words_given = given(half_word, 1)
+words_given, bytes_given = given(half_word, 1), given(tiny_word, 1)
+STRIDE = 16
+"""Words between two of which it is known how many entries are before them."""
 
 
 @compiled(images, given(integer, 2))
@@ -66,11 +69,29 @@ def equal_spans(among: Words, words: Words) -> tuple[Ints, Ints]:
     return begins, counts
 
 
-@compiled(numbers, given(small_integer, 1), integers, integers, numbers)
-def with_weights(scores: Array, owners: Rows, begins: Ints, counts: Ints, weights: Array) -> Array:
-    """Scores with the weight of each word added to each of its owners."""
+@compiled(bytes_given, words_given, words_given)
+def counted_spans(counts: Bytes, begins: Words, words: Words) -> tuple[Ints, Ints]:
+    """As `equal_spans` of entries of which is known how many have each word.
+
+    `begins` are the indices of the first entries of each STRIDE-th word.
+    """
+    first, n = np.empty(len(words), np.int64), np.empty(len(words), np.int64)
+    for i in range(len(words)):
+        word = np.int64(words[i])
+        at = np.int64(begins[word // STRIDE])
+        for before in range(word - word % STRIDE, word):
+            at += counts[before]
+        first[i], n[i] = at, counts[word]
+    return first, n
+
+
+@compiled(numbers, bytes_given, given(small_integer, 1), integers, integers, numbers)
+def with_weights(
+    scores: Array, owners: Bytes, rows: Rows, begins: Ints, counts: Ints, weights: Array
+) -> Array:
+    """Scores with the weight of each word added to each of its owners, which are some `rows`."""
     out = scores.copy()
     for i in range(len(begins)):
         for j in range(begins[i], begins[i] + counts[i]):
-            out[owners[j]] += weights[i]
+            out[rows[owners[j]]] += weights[i]
     return out

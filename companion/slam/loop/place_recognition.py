@@ -6,25 +6,27 @@ each of several tables; keyframes that share rare words are similar, as with a b
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from companion.geometry.transforms import Array
 from companion.messages import Bytes
 from companion.slam.compiled.word_matching import (
+    STRIDE,
     Rows,
     Words,
+    counted_spans,
     equal_spans,
     with_weights,
     words_of_bits,
 )
+from companion.slam.features.orb_features import Ints
 
 N_TABLES = 8
 N_BITS = 18
-BLOCK, MERGED = 32, 8
+N_WORDS = N_TABLES << N_BITS
+BLOCK, MERGED = 32, 7
 """Keyframes whose words are sorted together while more come; so many such blocks become one, as
-looking for words takes about as long in a block of any size."""
+looking for words takes about as long in a block of any size. A byte names the keyframes of one."""
 
 _CHOSEN = np.random.default_rng(20).permutation(256)[: N_TABLES * N_BITS].reshape(N_TABLES, N_BITS)
 
@@ -35,14 +37,42 @@ def words_of(descriptors: Bytes) -> Words:
     return words[np.r_[True, words[1:] != words[:-1]]] if len(words) else words
 
 
-@dataclass(slots=True, eq=False)
 class _Block:
-    """Sorted words of some keyframes, and the row in `keys` of the keyframe of each."""
+    """Words of some keyframes in order, and which of `rows` has each, by its index there.
 
-    words: Words = field(default_factory=lambda: np.zeros(0, np.uint32))
-    owners: Rows = field(default_factory=lambda: np.zeros(0, np.int32))
-    n_keys: int = 0
-    is_merged: bool = False
+    `rows` (K,) are those of the keyframes in the database, -1 where none. Of one that is merged is
+    kept how many have each word instead of the words: 19 KB for 1200 features instead of 50.
+    """
+
+    def __init__(self, rows: Rows, is_merged: bool = False) -> None:
+        self.rows, self.is_merged = rows, is_merged
+        self.owners: Bytes = np.zeros(0, np.uint8)
+        self._words: Words = np.zeros(0, np.uint32)
+        self._counts, self._begins = np.zeros(0, np.uint8), np.zeros(0, np.uint32)
+
+    @property
+    def n_keys(self) -> int:
+        return int(np.count_nonzero(self.rows >= 0))
+
+    @property
+    def words(self) -> Words:
+        if not self.is_merged:
+            return self._words
+        return np.repeat(np.arange(N_WORDS, dtype=np.uint32), self._counts)
+
+    def put(self, words: Words, owners: Bytes) -> None:
+        self.owners = owners
+        if not self.is_merged:
+            self._words = words
+            return
+        counts = np.bincount(words, minlength=N_WORDS)
+        self._counts = counts.astype(np.uint8)
+        self._begins = np.r_[0, np.cumsum(counts)[STRIDE - 1 :: STRIDE]].astype(np.uint32)
+
+    def spans(self, words: Words) -> tuple[Ints, Ints]:
+        if not self.is_merged:
+            return equal_spans(self._words, words)
+        return counted_spans(self._counts, self._begins, words)
 
 
 class KeyframeDatabase:
@@ -65,7 +95,7 @@ class KeyframeDatabase:
         """Add the descriptors (N, 32) of a keyframe."""
         block = next((b for b in self._blocks if b.n_keys < BLOCK and not b.is_merged), None)
         if block is None:
-            block = _Block()
+            block = _Block(np.full(BLOCK, -1, np.int32))
             self._blocks.append(block)
         if self._free:
             row = self._free.pop()
@@ -74,11 +104,12 @@ class KeyframeDatabase:
             row = len(self._keys)
             self._keys.append(key)
             self._block_of.append(block)
+        owner = int(np.argmin(block.rows))
+        block.rows[owner] = row
         words = words_of(descriptors)
         at = np.searchsorted(block.words, words)
-        block.words = np.insert(block.words, at, words)
-        block.owners = np.insert(block.owners, at, np.full(len(words), row, np.int32))
-        block.n_keys += 1
+        owners = np.insert(block.owners, at, np.full(len(words), owner, np.uint8))
+        block.put(np.insert(block.words, at, words), owners)
         self._merge()
 
     def _merge(self) -> None:
@@ -86,22 +117,23 @@ class KeyframeDatabase:
         full = [b for b in self._blocks if b.n_keys == BLOCK and not b.is_merged]
         if len(full) < MERGED:
             return
-        words = np.concatenate([b.words for b in full]).astype(np.int64)
-        both = np.sort(words << 32 | np.concatenate([b.owners for b in full]))
-        merged = _Block(
-            (both >> 32).astype(np.uint32), both.astype(np.int32), BLOCK * MERGED, is_merged=True
+        both: Words = np.concatenate(
+            [b.words << 8 | (b.owners + n * BLOCK) for n, b in enumerate(full)], dtype=np.uint32
         )
-        gone = set(map(id, full))
-        self._blocks = [b for b in self._blocks if id(b) not in gone] + [merged]
-        self._block_of = [merged if id(b) in gone else b for b in self._block_of]
+        both.sort()
+        merged = _Block(np.concatenate([b.rows for b in full]), is_merged=True)
+        merged.put(both >> np.uint32(8), both.astype(np.uint8))
+        self._blocks = [b for b in self._blocks if b not in full] + [merged]
+        self._block_of = [merged if b in full else b for b in self._block_of]
 
     def remove(self, key: int) -> None:
         """Remove a keyframe."""
         row = self._keys.index(key)
         block = self._block_of[row]
-        others = block.owners != row
-        block.words, block.owners = block.words[others], block.owners[others]
-        block.n_keys -= 1
+        owner = int(np.flatnonzero(block.rows == row)[0])
+        others = block.owners != owner
+        block.put(block.words[others], block.owners[others])
+        block.rows[owner] = -1
         self._keys[row] = -1
         self._free.append(row)
 
@@ -128,12 +160,12 @@ class KeyframeDatabase:
 
     def _scores(self, words: Words) -> Array:
         """Similarity of each row to these words, by inverse document frequency."""
-        spans = [equal_spans(block.words, words) for block in self._blocks]
+        spans = [block.spans(words) for block in self._blocks]
         sizes = np.zeros(len(words), np.int64)
         for _, counts in spans:
             sizes += counts
         rarity = np.log1p(len(self) / (1.0 + sizes))
         scores = np.zeros(len(self._keys))
         for block, (begins, counts) in zip(self._blocks, spans, strict=True):
-            scores = with_weights(scores, block.owners, begins, counts, rarity)
+            scores = with_weights(scores, block.owners, block.rows, begins, counts, rarity)
         return scores

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from companion.messages import Bytes
-from companion.slam.compiled.word_matching import equal_spans, with_weights
+from companion.slam.compiled.word_matching import (
+    STRIDE,
+    counted_spans,
+    equal_spans,
+    with_weights,
+)
 from companion.slam.loop import place_recognition
 from companion.slam.loop.place_recognition import (
     _CHOSEN,
@@ -40,11 +45,23 @@ def test_spans_are_those_of_a_search() -> None:
         assert (begins + counts).tolist() == np.searchsorted(among, words, "right").tolist()
 
 
+def test_spans_are_those_of_counts() -> None:
+    for n, m, most in ((0, 5, 64), (300, 40, 64), (900, 64, 64), (20, 400, 512)):
+        among = np.sort(RANDOM.integers(0, most, n).astype(np.uint32))
+        words = np.unique(RANDOM.integers(0, most, m).astype(np.uint32))
+        counts = np.bincount(among, minlength=most)
+        begins = np.r_[0, np.cumsum(counts)[STRIDE - 1 :: STRIDE]]
+        found = counted_spans(counts.astype(np.uint8), begins.astype(np.uint32), words)
+        for one, other in zip(found, equal_spans(among, words), strict=True):
+            assert one.tolist() == other.tolist()
+
+
 def test_weights_go_to_owners() -> None:
-    owners = np.array([0, 2, 2, 1], np.int32)
+    owners, rows = np.array([0, 1, 1, 2], np.uint8), np.array([0, 2, 1], np.int32)
     scores = with_weights(
         np.ones(3),
         owners,
+        rows,
         np.array([0, 3]),
         np.array([3, 1]),
         np.array([0.5, 2.0]),
