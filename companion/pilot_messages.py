@@ -66,6 +66,7 @@ MAP_TILTED = PilotMessage(WARNING, "map tilted: restarting")
 MAP_RESUMED = PilotMessage(NOTICE, "map resumed after restart")
 MAP_NOT_RESUMED = PilotMessage(NOTICE, "old map not recognised: new map")
 MAP_NOT_SAVED = PilotMessage(NOTICE, "map not saved for a restart")
+MAP_IN_MEMORY = PilotMessage(NOTICE, "disk full: map grows in memory")
 SITE_LOCATED = PilotMessage(INFO, "located in the saved map")
 SITE_REFUSED = PilotMessage(WARNING, "saved map contradicted: not used")
 SITE_MISPLACED = PilotMessage(WARNING, "saved map contradicted: place not used")
@@ -228,6 +229,7 @@ OF_WARNING: Mapping[str, PilotMessage] = {
     "map resumed after restart": MAP_RESUMED,
     "old map not recognised: new map": MAP_NOT_RESUMED,
     "the map cannot be kept for a restart in flight": MAP_NOT_SAVED,
+    "the disk takes no more of the map, which grows in memory": MAP_IN_MEMORY,
     "camera and autopilot were found to disagree, corrected": MOUNT_CORRECTED,
     "the autopilot's IMU is not used: no scale and no dead reckoning by it": IMU_NOT_USED,
     "the autopilot's IMU is used again": IMU_USED,

@@ -50,6 +50,7 @@ from companion.messages import (
 from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.site_map import SiteMap
 from companion.slam.map.sparse_map import Keyframe, SlamMap
+from companion.slam.mapping.far_keyframes import ArrayFile
 from companion.slam.tracking.tracker import Prior, Tracker
 from companion.telemetry import Telemetry
 from companion.timing.clock import Timer
@@ -174,6 +175,10 @@ class LocalisationStage:
     def look_ahead(self, grey: Bytes) -> None:
         """Begin with the image (H, W) of a frame to come, in order: the very array of its step."""
         self._tracker.look_ahead(grey)
+
+    def put_far_into(self, file: ArrayFile) -> None:
+        """Put most of the keyframes that the newest have left behind into a file from now on."""
+        self._tracker.atlas.far_file = file
 
     def set_effort(self, share: float) -> None:
         """Extract this ratio of the features from now on, under load."""

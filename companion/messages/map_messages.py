@@ -98,6 +98,9 @@ SPANS_REACH = 6
 class MapUpdate:
     """The map now: every keyframe's pose, and the sparse points (N, 3) in map units.
 
+    Of a map of more than a thousand keyframes the points are those near the newest one, but for the
+    last update of a flight, which has all.
+
     `scale_of` holds, for keyframes of segments with a scale of their own, the number of map units
     in one unit of the keyframe's camera frame; all others are 1. A keyframe that is missing here
     has no known pose, and neither has what is attached to it. `n_retired` redundant keyframes have

@@ -45,6 +45,8 @@ OF_WARNING: Mapping[str, str] = {
         "What is whole is used. companion map verify says what is lost.",
     "old map not recognised: new map": "Climb or fly some metres, so that it gets its scale.",
     "the map cannot be kept for a restart in flight": "Make room on the disk.",
+    "the disk takes no more of the map, which grows in memory":
+        "Delete flights before the next: over new ground an hour takes some gigabytes.",
     "camera and autopilot were found to disagree, corrected":
         "Put the angles that are said into the calibration, or into [mount].",
     "the autopilot's IMU is not used: no scale and no dead reckoning by it":

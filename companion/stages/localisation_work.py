@@ -6,6 +6,7 @@ import sys
 import traceback
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from companion.messages import (
     SiteMapUsed,
     Warned,
 )
+from companion.products.array_file import ArrayFile
 from companion.products.site_map_file import (
     SITE_MAP,
     SiteMapError,
@@ -44,6 +46,7 @@ NO_COLOUR = np.zeros((0, 0, 3), np.uint8)
 MAP_NOT_USED = "the map of an earlier flight cannot be read"
 MAP_DAMAGED = "the map of an earlier flight is damaged"
 NOT_KEPT = "the map cannot be kept for a restart in flight"
+IN_MEMORY = "the disk takes no more of the map, which grows in memory"
 
 
 class _Localisation(Work):
@@ -69,6 +72,9 @@ class _Localisation(Work):
         self._stage = LocalisationStage(
             setup.config, setup.camera, self.times, background=setup.is_live, site=self._site(setup)
         )
+        self._far = ArrayFile(setup.folder or Path(setup.config.daemon.flights))
+        self._stage.put_far_into(self._far)
+        self._is_far_fault_said = False
         if setup.is_live:  # in a process of its own; of the compiler of loops nothing is needed now
             give_back_heap()
             give_back_library_pages()
@@ -169,6 +175,9 @@ class _Localisation(Work):
             yield out
             if isinstance(out, MapUpdate):
                 yield Georeferenced(out.t_ns, out.georeference)
+        if self._far.fault and not self._is_far_fault_said:
+            self._is_far_fault_said = True
+            yield Warned(frame.t_ns, IN_MEMORY, self._far.fault)
         keeper = self._keeper
         if keeper is None or keeper.busy or frame.t_ns - self._kept_ns < KEEP_EVERY_NS:
             return

@@ -1,19 +1,23 @@
 """An hour over new ground: growth of the time per frame and of memory.
 
-    python -m tests.bench.new_ground [--frames 36000] [--rows 12]
+    python -m tests.bench.new_ground [--frames 36000] [--rows 12] [--end]
 
 Lanes of a survey over ground of dead leaves that never repeats, rendered at 480x360 and 10
 frames/s, with the autopilot's telemetry; in lockstep, without dense depth. Prints a row for each
 twelfth of the flight: processor time until a frame's pose (median, 95th percentile), of a keyframe,
-and what the process holds in memory (what it has written, without the pictures of the ground).
+what the process holds in memory (no page of a library), and in a file in the folder for temporary
+ones. With `--end` the flight then ends: how long that takes, and its largest memory.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import resource
+import tempfile
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ[variable] = "1"  # as the program does, before numpy loads
@@ -27,6 +31,8 @@ from companion.estimation.localisation import LocalisationStage  # noqa: E402
 from companion.geometry.camera import Camera  # noqa: E402
 from companion.geometry.transforms import Array, Pose, rotation_from_vector  # noqa: E402
 from companion.messages import Bytes, Frame, KeyframeAdded, Odometry, TrackState  # noqa: E402
+from companion.products.array_file import ArrayFile  # noqa: E402
+from companion.products.site_map_file import write_site_map  # noqa: E402
 from companion.runtime.in_order import in_order_of_time  # noqa: E402
 from companion.timing.clock import StageTimes  # noqa: E402
 from tests.support.flights.rendered_flight import (  # noqa: E402
@@ -43,6 +49,7 @@ LANE_M, APART_M = 600.0, 20.0
 """Neighbouring lanes share some ground."""
 N_PATTERNS, SIDE = 8, 512
 START_NS = 1_700_000_000_000_000_000
+FOLDER = Path(tempfile.gettempdir())
 
 
 class NewGround(Terrain):
@@ -113,15 +120,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--frames", type=int, default=36_000)
     parser.add_argument("--rows", type=int, default=12)
+    parser.add_argument("--end", action="store_true")
     options = parser.parse_args()
-    stage = LocalisationStage(Config(), CAMERA, StageTimes())
+    stage, file = LocalisationStage(Config(), CAMERA, StageTimes()), ArrayFile(FOLDER)
+    stage.put_far_into(file)
     pose_ms: list[float] = []
     keyframe_ms: list[float] = []
     n_tracked = 0
     process = psutil.Process()
     samples = telemetry_of(ned_from_body, options.frames / RATE_HZ)
     print(
-        "| frames | tracked | pose, median, 95th | keyframe | keyframes | memory |\n" + "|---" * 6
+        "| frames | tracked | pose, median, 95th | keyframe | keyframes | memory | file |\n"
+        + "|---" * 7
     )
     for message in in_order_of_time(samples, frames(options.frames)):
         began_ns, is_keyframe, ms = time.thread_time_ns(), False, 0.0
@@ -142,9 +152,23 @@ def main() -> None:
                 f"| {message.seq + 1} | {100 * n_tracked / every:.0f} % | "
                 f"{np.median(pose_ms):.1f}, {np.percentile(pose_ms, 95):.1f} ms | "
                 f"{np.median(keyframe_ms or [np.nan]):.0f} ms | {len(keyframe_ms)} | "
-                f"{process.memory_full_info().uss / 1e6:.0f} MB |", flush=True,
+                f"{process.memory_full_info().uss / 1e6:.0f} MB | {file.n_bytes / 1e6:.0f} MB |",
+                flush=True,
             )  # fmt: skip
             pose_ms, keyframe_ms, n_tracked = [], [], 0
+    if options.end:
+        began_s = time.monotonic()
+        stage.finish()
+        adjusted_s = time.monotonic()
+        site = stage.site_map("new ground", None)
+        assert site is not None
+        write_site_map(FOLDER / "new_ground.map", site)
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        print(
+            f"adjusted in {adjusted_s - began_s:.0f} s, map of {len(site.keyframes)} keyframes and "
+            f"{len(site.points.positions)} points in {time.monotonic() - adjusted_s:.0f} s, "
+            f"{(FOLDER / 'new_ground.map').stat().st_size / 1e6:.0f} MB; {peak_mb:.0f} MB at most"
+        )
 
 
 if __name__ == "__main__":

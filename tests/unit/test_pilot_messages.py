@@ -129,6 +129,7 @@ def test_every_warning_has_its_words() -> None:
         *phrases(camera_feed), *phrases(disk_writer), *phrases(live_samples),
         link_watch.DAMAGED, link_watch.REFUSED, link_watch.FLOODS, link_watch.SLOW,
         map_resumption.MAP_RESUMED, map_resumption.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
+        localisation_work.IN_MEMORY,
         link_watch.NO_MAVLINK, live_flight.RESTARTED, live_flight.LOCALISATION_DIED,
         live_flight.NOT_FINISHED,
         imu_verdict.NOT_USED, imu_verdict.USED_AGAIN,

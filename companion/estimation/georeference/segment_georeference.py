@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
@@ -29,6 +30,11 @@ from companion.slam.optimisation.displacement_factor import DisplacementFactor
 MAX_LOOP_ERROR_M = 6.0
 """Error of measured positions between two times."""
 MAX_SAMPLES, MAX_SAMPLES_FINAL = 120, 400
+MAX_TOLD_WHOLE, N_TOLD = 1000, 400
+"""Keyframes up to which all points of a map are told in flight; of a larger one those that so many
+about the newest observe: each keyframe tells them again, to all who listen."""
+MAX_COMPARED = 2000
+"""Newest keyframes whose displacements say how well the velocity fits."""
 MAX_GROUND_DISTANCES = 40
 """Half a millisecond each, on the way to a pose; their median is no more certain of more."""
 SETTLED_AFTER = 2
@@ -138,7 +144,10 @@ class SegmentGeoreferences:
                 continue
             if final or (segment is segments[-1] and _due(segment)):
                 found = self._georeferencer.solve(
-                    self._samples(segment, _subsample(segment, final)),
+                    self._samples(
+                        segment,
+                        segment.spread_keyframes(MAX_SAMPLES_FINAL if final else MAX_SAMPLES),
+                    ),
                     self._inertial_scale(segment, final),
                     self.depths.of(segment),
                 )
@@ -166,7 +175,11 @@ class SegmentGeoreferences:
             if segment is segments[-1]:
                 self.main_from_newest = main_from_own
             n_retired += len(segment.retired)
-            table, positions = segment.poses(), segment.point_positions()
+            table = segment.poses()
+            if final or len(segment.keyframes) <= MAX_TOLD_WHOLE:
+                positions = segment.point_positions()
+            else:
+                positions = segment.positions_about_newest(N_TOLD)
             if segment is not main:
                 table, positions = table.placed(main_from_own), main_from_own.apply(positions)
             poses.append(table)
@@ -225,7 +238,7 @@ class SegmentGeoreferences:
         placed = self.of(segment)
         if placed is None:
             return None
-        everywhere = list(segment.keyframes.values())
+        everywhere = list(islice(reversed(segment.keyframes.values()), MAX_COMPARED))[::-1]
         return displacement_factor(self._georeferencer, placed, everywhere, keyframes)
 
     def _main_of(self, segments: Sequence[SlamMap], final: bool) -> SlamMap:
@@ -366,11 +379,3 @@ def _beginning_at(own: Georeference, first: Keyframe, start_ned_m: Array) -> Geo
 def _due(segment: SlamMap) -> bool:
     n = len(segment.keyframes)
     return n < 40 or n % 5 == 0
-
-
-def _subsample(segment: SlamMap, final: bool) -> list[Keyframe]:
-    keyframes = list(segment.keyframes.values())
-    most = MAX_SAMPLES_FINAL if final else MAX_SAMPLES
-    if len(keyframes) <= most:
-        return keyframes
-    return [keyframes[int(i)] for i in np.linspace(0, len(keyframes) - 1, most).astype(int)]

@@ -28,7 +28,7 @@ def merge_maps(here: SlamMap, there: SlamMap, here_from_there: Similarity) -> No
     for key, keyframe in there.keyframes.items():
         keyframe.camera_from_map = camera_from_there(keyframe.camera_from_map, there_from_here)
         keyframe.point_ids = np.where(keyframe.point_ids >= 0, keyframe.point_ids + offset, -1)
-        keyframe.refined_for[:] = -1  # by ids of the other map
+        keyframe.refined_for = np.full(len(keyframe.features), -1)  # by ids of the other map
         here.keyframes[key] = keyframe
         here.unit_of[key] = there.unit_of.get(key, 1.0) * here_from_there.scale
     for key, retired in there.retired.items():
@@ -39,7 +39,7 @@ def merge_maps(here: SlamMap, there: SlamMap, here_from_there: Similarity) -> No
     ordered = sorted(here.keyframes.items())
     here.keyframes.clear()
     here.keyframes.update(ordered)
-    here.invalidate_centres()
+    here.keyframes_moved()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,7 +137,7 @@ def _move(
         slam_map.retired[key] = retired.scaled(scale)
         slam_map.unit_of[key] = slam_map.unit_of.get(key, 1.0) * scale
     slam_map.base_distance[:n] *= scales
-    slam_map.invalidate_centres()
+    slam_map.keyframes_moved()
 
 
 def _anchors(slam_map: SlamMap, keys: Ints) -> Ints:

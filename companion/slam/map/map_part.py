@@ -92,7 +92,7 @@ def map_of(part: MapPart, scale_factor: float, n_levels: int, shift_ns: int = 0)
         slam_map.keyframes[keyframe.keyframe_id] = keyframe
         features = np.flatnonzero(keyframe.point_ids >= 0)
         _observe(slam_map, keyframe, keyframe.point_ids[features])
-    slam_map.invalidate_centres()
+    slam_map.keyframes_moved()
     return slam_map
 
 

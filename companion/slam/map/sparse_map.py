@@ -6,6 +6,7 @@ an id is recycled only once nothing can still refer to the old point.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -15,9 +16,10 @@ from companion.geometry.pose_table import PoseTable
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Bytes
 from companion.slam.compiled.observing import observed
-from companion.slam.compiled.patch_alignment import STORED
 from companion.slam.features.orb_features import Bools, Features, Ints
 from companion.slam.features.patches import Patches, cut, level_of
+from companion.slam.map.keyframe_places import KeyframePlaces
+from companion.slam.map.patch_store import NO_PATCH, PatchStore
 
 N_OBSERVERS_KEPT = 8
 ID_QUARANTINE_KEYFRAMES = 40
@@ -28,7 +30,7 @@ MAX_COVISIBLE_CANDIDATES = 60
 ARRAYS = (
     "observers", "positions", "alive", "descriptors", "normals", "base_distance", "n_visible",
     "n_found", "n_observers", "born", "first_seen", "first_unproject", "patch_at", "patch_centre",
-    "patch_level",
+    "patch_level", "is_named",
 )  # fmt: skip
 
 
@@ -51,6 +53,8 @@ class Keyframe:
     """Image (H, W), while patch alignment may still use it."""
     ned_from_camera: Array | None = None
     """Attitude (3, 3) by the autopilot, where measured."""
+    is_far: bool = False
+    """Left behind: features, their refinement and the patches of its points may lie in a file."""
 
     @property
     def centre(self) -> Array:
@@ -124,20 +128,16 @@ class SlamMap:
     """Id (P,) of the keyframe at which the point was created."""
     first_seen: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """Id (P,) of the keyframe with the reference view of the patch."""
-    _centres: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    """Of the keyframes `_ids`, at their poses `_posed`."""
-    _ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    _posed: dict[int, Pose] = field(default_factory=dict)
-    _are_centres_known: bool = False
+    _places: KeyframePlaces = field(default_factory=KeyframePlaces)
     first_unproject: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
     """Jacobian of the reference view's normalised coordinates by its pixels"""
     patch_at: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Row (P,) of a point's patch in `patch_grey`, while the point is alive."""
+    """Number (P,) of a point's patch, while the point is alive."""
     patch_centre: Array = field(default_factory=lambda: np.zeros((0, 2)))
     patch_level: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    patch_grey: Bytes = field(default_factory=lambda: np.zeros((0, STORED, STORED), np.uint8))
-    _free: list[int] = field(default_factory=list)
-    """Rows of patches of removed points."""
+    is_named: Bools = field(default_factory=lambda: np.zeros(0, bool))
+    """Points (P,) that far keyframes name, dead or alive: their ids are not recycled."""
+    patches: PatchStore = field(default_factory=PatchStore)
     _free_ids: list[int] = field(default_factory=list)
     """Point ids to recycle, the lowest last."""
     _quarantined_ids: list[int] = field(default_factory=list)
@@ -181,30 +181,28 @@ class SlamMap:
             levels, seen.pixels[features].astype(np.float64),
             level_of(seen.octaves[features], self.scale_factor),
         )  # fmt: skip
-        self._store(ids, patches.grey)
+        self.patch_at[ids] = self.patches.add(patches.grey)
         self.patch_centre[ids] = patches.centre
         self.patch_level[ids] = patches.level
         self.n_points += n_more
         return ids
 
-    def _store(self, ids: Ints, grey: Bytes) -> None:
-        """Store the patches of new points, in rows freed by removed points first."""
-        missing = len(ids) - len(self._free)
-        if missing > 0:
-            size = len(self.patch_grey)
-            new = max(4096, size // 2, missing)
-            grown = np.zeros((size + new, STORED, STORED), np.uint8)
-            grown[:size] = self.patch_grey
-            self.patch_grey = grown
-            self._free += range(size + new - 1, size - 1, -1)
-        self.patch_at[ids] = [self._free.pop() for _ in range(len(ids))]
-        self.patch_grey[self.patch_at[ids]] = grey
-
     def free_patches(self) -> None:
-        """Release the patch rows of removed points."""
-        dead = np.flatnonzero(~self.alive[: self.n_points] & (self.patch_at[: self.n_points] >= 0))
-        self._free += self.patch_at[dead].tolist()
-        self.patch_at[dead] = self.patch_level[dead] = -1
+        """Release the patches of removed points."""
+        n = self.n_points
+        dead = np.flatnonzero(~self.alive[:n] & (self.patch_at[:n] != NO_PATCH))
+        self.patches.free(self.patch_at[dead])
+        self.patch_at[dead] = self.patch_level[dead] = NO_PATCH
+
+    def put_patches_away(self, ids: Ints, grey: Bytes) -> None:
+        """Keep the patches of points in an array of equal ones, which may lie in a file."""
+        self.patch_at[ids] = self.patches.put_away(self.patch_at[ids], grey)
+
+    def leave_behind(self, keyframe: Keyframe) -> None:
+        """Let ids that a keyframe names be as they are, and refine its features no more."""
+        keyframe.is_far, keyframe.grey = True, None
+        for ids in (keyframe.point_ids, keyframe.refined_for):
+            self.is_named[ids[ids >= 0]] = True
 
     def recycle_ids(self) -> None:
         """Recycle ids of points removed long ago; called once per keyframe."""
@@ -214,9 +212,12 @@ class SlamMap:
         self._quarantine_age = 0
         n = self.n_points
         known = self.alive[:n].copy()
+        known |= self.is_named[:n]
         known[self._free_ids + self._quarantined_ids] = True
         dead = np.r_[~known, False]
         for keyframe in self.keyframes.values():
+            if keyframe.is_far:
+                continue
             for ids in (keyframe.point_ids, keyframe.refined_for):
                 ids[dead[ids]] = -1
         self._free_ids = sorted(self._free_ids + self._quarantined_ids, reverse=True)
@@ -233,8 +234,8 @@ class SlamMap:
         self.normals[new] = self.normals[new] @ own_from_other.rotation.T
         self.base_distance[new] *= own_from_other.scale
         self.n_points += n
-        held = np.flatnonzero(other.patch_at[:n] >= 0)
-        self._store(offset + held, other.patch_grey[other.patch_at[held]])
+        held = np.flatnonzero(other.patch_at[:n] != NO_PATCH)
+        self.patch_at[offset + held] = self.patches.add(other.patches.of(other.patch_at[held]))
         return offset
 
     def load_points(self, points: PointArrays) -> None:
@@ -248,17 +249,17 @@ class SlamMap:
                 getattr(self, name)[every] = values
         self.alive[every] = True
         self.observers[every] = -1
-        self._store(np.arange(n), points.patch_grey)
+        self.patch_at[every] = self.patches.add(points.patch_grey)
 
     def points_of(self, ids: Ints) -> PointArrays:
         """Copies of the data of living points, without their observations."""
         rows = [getattr(self, name)[ids] for name in PointArrays._fields[:-1]]
-        return PointArrays._make([*rows, self.patch_grey[self.patch_at[ids]]])
+        return PointArrays._make([*rows, self.patches.of(self.patch_at[ids])])
 
     def patches_of(self, points: Ints) -> Patches:
         """The patches of some points."""
         return Patches(
-            self.patch_grey[self.patch_at[points]],
+            self.patches.of(self.patch_at[points]),
             self.patch_centre[points],
             self.patch_level[points],
         )
@@ -350,45 +351,36 @@ class SlamMap:
 
     def poses(self) -> PoseTable:
         """`map_from_camera` of every keyframe, culled ones included."""
-        living = PoseTable.of({key: k.camera_from_map for key, k in self.keyframes.items()})
-        living = living.inverse()
+        living = self._places.poses(self.keyframes).inverse()
         if not self.retired:
             return living
         anchors = np.array([each.anchor_id for each in self.retired.values()], np.int64)
         apart = PoseTable.of({key: r.anchor_from_camera for key, r in self.retired.items()})
         return PoseTable.joined([living, living.followed_by(anchors, apart)])
 
-    def invalidate_centres(self) -> None:
-        """Invalidate cached camera centres after keyframes were added or moved."""
-        self._are_centres_known = False
-
-    def _update_centres(self) -> None:
-        """Centres of those that are new or moved; the others, most of a large map, are kept."""
-        posed = {key: k.camera_from_map for key, k in self.keyframes.items()}
-        ids = np.fromiter(posed, np.int64, len(posed))
-        at = np.minimum(np.searchsorted(self._ids, ids), max(len(self._ids) - 1, 0))
-        if len(self._ids):
-            centres, known = self._centres[at], (self._ids[at] == ids).tolist()
-        else:
-            centres, known = np.empty((len(ids), 3)), [False] * len(ids)
-        for row, (key, pose) in enumerate(posed.items()):
-            if not known[row] or self._posed.get(key) is not pose:
-                centres[row] = self.keyframes[key].centre
-        self._ids, self._centres, self._posed = ids, centres, posed
-        self._are_centres_known = True
+    def keyframes_moved(self, ids: Iterable[int] | None = None) -> None:
+        """To be called after keyframes were added, moved or removed: some, or any."""
+        self._places.move(ids)
 
     def nearest(self, centre: Array, n: int, exclude: set[int]) -> list[int]:
         """Ids of the `n` keyframes nearest to a position (3,), without those in `exclude`."""
-        if not self._are_centres_known:
-            self._update_centres()
-        apart = np.linalg.norm(self._centres - centre, axis=1)
-        most = n + len(exclude)
-        near = np.arange(len(apart))
-        if most < len(apart):
-            near = np.flatnonzero(apart <= np.partition(apart, most - 1)[most - 1])
-        near = near[np.argsort(apart[near], kind="stable")][:most]
-        return [k for k in self._ids[near].tolist() if k not in exclude][:n]
+        return self._places.nearest(self.keyframes, centre, n, exclude)
+
+    def spread_keyframes(self, most: int) -> list[Keyframe]:
+        """All keyframes in order, or so many of them spread over the flight."""
+        keyframes = list(self.keyframes.values())
+        if len(keyframes) <= most:
+            return keyframes
+        return [keyframes[int(i)] for i in np.linspace(0, len(keyframes) - 1, most).astype(int)]
+
+    def positions_about_newest(self, n_keyframes: int) -> Array:
+        """Positions (M, 3) of points that the keyframes nearest to the newest one observe."""
+        newest = self.keyframes[next(reversed(self.keyframes))]
+        near = np.zeros(self.n_points, bool)
+        for key in self.nearest(newest.centre, n_keyframes, set()):
+            near[self.observations_of(self.keyframes[key])[1]] = True
+        return self.positions[: self.n_points][near]
 
     def point_positions(self) -> Array:
         """Positions (M, 3) of all living points."""
-        return self.positions[: self.n_points][self.alive[: self.n_points]].copy()
+        return self.positions[: self.n_points][self.alive[: self.n_points]]

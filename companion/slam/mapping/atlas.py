@@ -21,6 +21,7 @@ from companion.slam.loop.relocalizer import (
     covisible_points,
 )
 from companion.slam.map.sparse_map import Keyframe, SlamMap
+from companion.slam.mapping.far_keyframes import ArrayFile, leave_behind
 from companion.slam.mapping.map_adjustment import DisplacementSource, no_displacements
 from companion.slam.mapping.mapper import Mapper
 from companion.slam.mapping.mapping_worker import MapLock
@@ -70,6 +71,8 @@ class Atlas:
         """Accepts or rejects a loop closure by information other than the images."""
         self.displacements_of: DisplacementSource = no_displacements
         """Displacement factors between cameras, from information other than the images."""
+        self.far_file: ArrayFile | None = None
+        """Takes most of the keyframes that are left behind; without one they stay in memory."""
         self.n_loops = 0
         self.new_map(level=False)
 
@@ -172,6 +175,7 @@ class Atlas:
         mapper = self.mapper_of(segment)
         for culled in mapper.add(keyframe):
             self._database.remove(culled)
+        leave_behind(segment, self.far_file, self._map_lock)
         self._map_lock.yield_to_tracking()
         self._cooldown -= 1
         found = None

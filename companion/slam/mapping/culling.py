@@ -89,7 +89,7 @@ def retire(slam_map: SlamMap, keyframe: Keyframe, anchor: Keyframe) -> None:
     _drop_observer(slam_map, key, points)
     keyframe.grey = None
     del slam_map.keyframes[key]
-    slam_map.invalidate_centres()
+    slam_map.keyframes_moved([key])
 
 
 def _drop_observer(slam_map: SlamMap, key: int, points: Ints) -> None:

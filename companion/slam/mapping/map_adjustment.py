@@ -24,6 +24,8 @@ from companion.slam.optimisation.rotation_factor import relative_rotation_factor
 MAX_VARIABLE, MAX_FIXED = 500, 80
 """Keyframes adjusted in one problem, whose memory is quadratic in them, and fixed ones around them.
 """
+MAX_COMPARED = 2000
+"""Keyframes whose attitudes say where down is in a map: the median of more is no more certain."""
 MAX_ROTATION_SPAN_NS = 2_000_000_000
 """Over longer spans integrated gyroscopes are no better than gravity and compass."""
 
@@ -91,7 +93,7 @@ def _factors(
     slam_map: SlamMap, cameras: list[Keyframe], displacements: DisplacementFactor | None
 ) -> list[Factor]:
     """Factors from the autopilot: gravity or else relative rotations, and displacements."""
-    everywhere, attitudes = list(slam_map.keyframes.values()), _attitudes(cameras)
+    everywhere, attitudes = slam_map.spread_keyframes(MAX_COMPARED), _attitudes(cameras)
     rotation = np.stack([k.camera_from_map.rotation for k in everywhere])
     down = gravity_in_map(rotation, _attitudes(everywhere)[:, 2])
     if down is not None:
@@ -115,11 +117,10 @@ def _attitudes(keyframes: list[Keyframe]) -> Array:
 
 def apply_result(slam_map: SlamMap, problem: AdjustmentProblem, result: AdjustmentResult) -> None:
     """Write back a result to an unchanged map."""
-    for keyframe, pose in zip(
-        problem.keyframes[: problem.bundle.n_variable], result.poses, strict=False
-    ):
+    moved = problem.keyframes[: problem.bundle.n_variable]
+    for keyframe, pose in zip(moved, result.poses, strict=False):
         keyframe.camera_from_map = pose
-    slam_map.invalidate_centres()
+    slam_map.keyframes_moved(k.keyframe_id for k in moved)
     slam_map.positions[problem.points] = result.points
     _remove_outliers(slam_map, problem, result)
 
@@ -132,7 +133,7 @@ def apply_result_later(
     moves = _moves(slam_map, problem, result)
     for key, keyframe in slam_map.keyframes.items():
         keyframe.camera_from_map = keyframe.camera_from_map @ moves[key].inverse()
-    slam_map.invalidate_centres()
+    slam_map.keyframes_moved()
     same = slam_map.alive[problem.points] & (slam_map.born[problem.points] == problem.born)
     known = problem.points[same]
     slam_map.positions[known] = before[known] + (result.points - problem.bundle.points)[same]

@@ -61,7 +61,7 @@ class Mapper:
         """Insert a keyframe, whose tracked points are set; ids of the keyframes culled for it."""
         slam_map = self._map
         slam_map.keyframes[keyframe.keyframe_id] = keyframe
-        slam_map.invalidate_centres()
+        slam_map.keyframes_moved([keyframe.keyframe_id])
         for key in islice(reversed(slam_map.keyframes), N_IMAGES_KEPT, N_IMAGES_KEPT + 2):
             slam_map.keyframes[key].grey = None
         _, points = slam_map.observations_of(keyframe)
@@ -340,12 +340,12 @@ class Mapper:
         """Remove recent points that are seldom found where visible, or have too few observers."""
         slam_map = self._map
         n = slam_map.n_points
-        age = keyframe.keyframe_id - slam_map.born[:n]
-        recent = slam_map.alive[:n] & (age <= 4)
-        seldom = slam_map.n_found[:n] < 0.25 * slam_map.n_visible[:n]
-        few = (age >= 2) & (slam_map.n_observers[:n] <= 2)
-        doomed = recent & (seldom | few)
-        slam_map.alive[:n][doomed] = False
+        newest = slam_map.born[:n] >= keyframe.keyframe_id - 4
+        recent = np.flatnonzero(slam_map.alive[:n] & newest)
+        seldom = slam_map.n_found[recent] < 0.25 * slam_map.n_visible[recent]
+        settled = slam_map.born[recent] <= keyframe.keyframe_id - 2
+        few = settled & (slam_map.n_observers[recent] <= 2)
+        slam_map.alive[recent[seldom | few]] = False
         slam_map.clear_dead_observations(
             [slam_map.keyframes[key] for key in islice(reversed(slam_map.keyframes), 30)]
         )

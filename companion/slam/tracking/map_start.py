@@ -29,7 +29,7 @@ def initialise_map(
         keyframe.refined_for[:] = -1  # a view that was tracked in another map names points of that
     slam_map.first_keyframe_id = first.keyframe_id
     slam_map.keyframes[first.keyframe_id] = first
-    slam_map.invalidate_centres()
+    slam_map.keyframes_moved()
     slam_map.add_observations(first, start.features_first, ids)
     slam_map.add_observations(second, start.features_second, ids)
     slam_map.update_geometry(ids, [first, second])
@@ -58,7 +58,7 @@ def continue_map(
     tracked = np.flatnonzero(last_tracked.point_ids >= 0)
     tracked = tracked[slam_map.alive[last_tracked.point_ids[tracked]]]
     slam_map.keyframes[first.keyframe_id] = first
-    slam_map.invalidate_centres()
+    slam_map.keyframes_moved()
     slam_map.add_observations(first, tracked, last_tracked.point_ids[tracked])
     ids = slam_map.add_points(
         continuation.points_map, first, continuation.features_first, image_levels(last_tracked.grey)

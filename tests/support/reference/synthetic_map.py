@@ -95,6 +95,16 @@ def mapped(
         points = np.array([known[i] for i in index.tolist()])
         slam_map.add_observations(keyframe, np.arange(len(features)), points)
         slam_map.update_geometry(points, [keyframe])
-        slam_map.invalidate_centres()
+        slam_map.keyframes_moved()
         after_each(slam_map, keyframe)
     return slam_map
+
+
+def bend(slam_map: SlamMap, per_keyframe: float) -> None:
+    """Let the map drift sideways."""
+    for key, keyframe in slam_map.keyframes.items():
+        shift = np.array([0.0, per_keyframe * key, 0.0])
+        pose = keyframe.camera_from_map.inverse()
+        keyframe.camera_from_map = Pose(pose.rotation, pose.translation + shift).inverse()
+    n = slam_map.n_points
+    slam_map.positions[:n, 1] += per_keyframe * slam_map.first_seen[:n]

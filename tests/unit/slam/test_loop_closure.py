@@ -28,7 +28,7 @@ from companion.slam.mapping.atlas import Atlas
 from companion.slam.mapping.mapping_worker import MapLock
 from companion.slam.optimisation.pose_graph import Edge, relax
 from companion.slam.optimisation.upright_pose import upright_pose
-from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
+from tests.support.reference.synthetic_map import CAMERA, Ground, bend, flown, mapped
 
 NOWHERE = Similarity.identity()
 ELSEWHERE = Similarity(0.4, yaw_rotation(1.1), np.array([3.0, -7.0, 2.0]))
@@ -144,7 +144,7 @@ def test_loop_closure_moves_its_points() -> None:
     sides = itertools.pairwise(corners)
     path = [pose for a, b in sides for pose in line(a, b, 9, 0.0)]
     slam_map = mapped(ground, path, NOWHERE, memory=12)
-    _bend(slam_map, 0.05)
+    bend(slam_map, 0.05)
     newest = max(slam_map.keyframes)
     off = np.linalg.norm(slam_map.keyframes[newest].centre - path[-1].translation)
     assert off > 1.0
@@ -170,7 +170,7 @@ def test_frames_are_tracked_while_the_graph_of_a_loop_is_relaxed(
     corners = [(0.0, 0.0), (16.0, 0.0), (16.0, 16.0), (0.0, 16.0), (0.0, 1.0)]
     path = [pose for a, b in itertools.pairwise(corners) for pose in line(a, b, 9, 0.0)]
     slam_map = mapped(ground, path, NOWHERE, memory=12)
-    _bend(slam_map, 0.05)
+    bend(slam_map, 0.05)
     found = find(max(slam_map.keyframes), slam_map, [slam_map])
     assert found is not None
     lock = MapLock()
@@ -199,21 +199,11 @@ def test_frames_are_tracked_while_the_graph_of_a_loop_is_relaxed(
     assert lock.point - point > len(slam_map.keyframes) / 10  # and it yields besides
     assert found.keyframe.centre == pytest.approx(path[-1].translation, abs=0.3)
     begins_anew = True
-    _bend(slam_map, 0.05)
+    bend(slam_map, 0.05)
     drifted = found.keyframe.centre
     with lock.mapping():
         assert atlas._close(slam_map, atlas.mapper, found) is None
     assert found.keyframe.centre == pytest.approx(drifted)
-
-
-def _bend(slam_map: SlamMap, per_keyframe: float) -> None:
-    """Let the map drift sideways."""
-    for key, keyframe in slam_map.keyframes.items():
-        shift = np.array([0.0, per_keyframe * key, 0.0])
-        pose = keyframe.camera_from_map.inverse()
-        keyframe.camera_from_map = Pose(pose.rotation, pose.translation + shift).inverse()
-    n = slam_map.n_points
-    slam_map.positions[:n, 1] += per_keyframe * slam_map.first_seen[:n]
 
 
 @pytest.mark.parametrize("level", [True, False], ids=["level", "vision alone"])

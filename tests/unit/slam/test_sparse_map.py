@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -41,7 +43,7 @@ def test_nearest_keyframes_follow_moved_ones(slam_map: SlamMap) -> None:
     ) == {2, 4, 5}
     far = slam_map.keyframes[20]
     far.camera_from_map = slam_map.keyframes[3].camera_from_map
-    slam_map.invalidate_centres()
+    slam_map.keyframes_moved()
     assert 20 in slam_map.nearest(place, 3, {3})
 
 
@@ -52,9 +54,10 @@ def test_nearest_keyframes_are_those_of_a_search_of_all(slam_map: SlamMap) -> No
         apart = {k: np.linalg.norm(f.centre - place) for k, f in slam_map.keyframes.items()}
         return [k for k in sorted(apart, key=lambda k: apart[k]) if k not in exclude][:n]
 
-    for turn in range(60):
+    for turn in range(80):
         keys = list(slam_map.keyframes)
         key = keys[random.integers(len(keys))]
+        changed: list[int] | None = [key]
         if turn % 3 == 0:
             pose = slam_map.keyframes[key].camera_from_map
             slam_map.keyframes[key].camera_from_map = Pose(
@@ -62,18 +65,29 @@ def test_nearest_keyframes_are_those_of_a_search_of_all(slam_map: SlamMap) -> No
             )
         elif turn % 7 == 1:
             del slam_map.keyframes[key]
+        elif turn % 7 == 2:
+            changed = [100 + turn]
+            slam_map.keyframes[100 + turn] = replace(
+                slam_map.keyframes[key], keyframe_id=100 + turn
+            )
         elif turn % 7 == 5:  # as when maps are merged, not in order
             slam_map.keyframes[key] = slam_map.keyframes.pop(key)
-        slam_map.invalidate_centres()
+            changed = None
+        slam_map.keyframes_moved(changed)
         place = random.normal(scale=10.0, size=3)
         exclude = set(random.choice(keys, 3).tolist())
         for n in (1, 4, len(keys)):
             assert slam_map.nearest(place, n, exclude) == searched(place, n, exclude)
+        poses = slam_map.poses()
+        assert list(poses) == list(slam_map.keyframes)
+        for key, pose in poses.items():
+            there = slam_map.keyframes[key].camera_from_map.inverse()
+            np.testing.assert_allclose(pose.matrix(), there.matrix(), atol=1e-12)
 
 
 def test_patch_rows_of_removed_points_are_reused(slam_map: SlamMap) -> None:
     keyframe = slam_map.keyframes[0]
-    size = len(slam_map.patch_grey)
+    size = len(slam_map.patches.near)
     levels = image_levels(GREY)
     features = np.arange(len(keyframe.features))
     positions: Array = np.zeros((len(features), 3))
@@ -83,7 +97,7 @@ def test_patch_rows_of_removed_points_are_reused(slam_map: SlamMap) -> None:
         slam_map.alive[ids] = False
         slam_map.free_patches()
         assert (slam_map.patch_at[ids] == -1).all()
-    assert len(slam_map.patch_grey) == size
+    assert len(slam_map.patches.near) == size
 
 
 def test_planar_pose_is_found_without_initial_guess() -> None:

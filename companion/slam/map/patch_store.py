@@ -1,0 +1,63 @@
+"""Patches of map points, by rows that are used again; those of far points lie in other arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from companion.messages import Bytes
+from companion.slam.compiled.patch_alignment import STORED
+from companion.slam.features.orb_features import Ints
+
+NO_PATCH = -1
+LEAST_ROWS = 4096
+
+
+@dataclass(slots=True, eq=False)
+class PatchStore:
+    """Patches (24, 24) u8 by number: from 0 in `near`, below NO_PATCH in arrays put away."""
+
+    near: Bytes = field(default_factory=lambda: np.zeros((0, STORED, STORED), np.uint8))
+    _free: list[int] = field(default_factory=list)
+    _far: list[Bytes] = field(default_factory=list)
+    _far_begins: list[int] = field(default_factory=lambda: [0])
+    """Number of patches before each array of `_far`, and of all."""
+
+    def add(self, grey: Bytes) -> list[int]:
+        """Store patches (N, 24, 24); their numbers."""
+        missing = len(grey) - len(self._free)
+        if missing > 0:
+            size = len(self.near)
+            new = max(LEAST_ROWS, size // 2, missing)
+            grown = np.zeros((size + new, STORED, STORED), np.uint8)
+            grown[:size] = self.near
+            self.near = grown
+            self._free += range(size + new - 1, size - 1, -1)
+        numbers = [self._free.pop() for _ in range(len(grey))]
+        self.near[numbers] = grey
+        return numbers
+
+    def free(self, numbers: Ints) -> None:
+        """Use the rows of patches that are not needed any more again; far ones have none."""
+        self._free += numbers[numbers >= 0].tolist()
+
+    def of(self, numbers: Ints) -> Bytes:
+        """The patches (N, 24, 24), a copy; of NO_PATCH anything."""
+        grey = self.near[np.maximum(numbers, NO_PATCH)]
+        is_far = numbers < NO_PATCH
+        if is_far.any():
+            at = NO_PATCH - 1 - numbers
+            which = np.searchsorted(self._far_begins, at, "right") - 1
+            for k in np.unique(which[is_far]).tolist():
+                own = is_far & (which == k)
+                grey[own] = self._far[k][at[own] - self._far_begins[k]]
+        return grey
+
+    def put_away(self, numbers: Ints, grey: Bytes) -> Ints:
+        """Free the rows of near patches, which are in an array `grey` from now on; new numbers."""
+        self.free(numbers)
+        first = self._far_begins[-1]
+        self._far.append(grey)
+        self._far_begins.append(first + len(grey))
+        return NO_PATCH - 1 - np.arange(first, first + len(grey))

@@ -1,0 +1,57 @@
+"""Keyframes that the newest have left behind: most of them, and patches of their points, in a file.
+
+Poses, and which points a keyframe observes, stay in memory. What is in the file is read where it
+lies, so that no result depends on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import islice
+from typing import Any, Protocol
+
+import numpy as np
+
+from companion.slam.map.patch_store import NO_PATCH
+from companion.slam.map.sparse_map import SlamMap
+from companion.slam.mapping.mapping_worker import MapLock
+
+N_NEAR = 400
+"""Newest keyframes, all in memory: two minutes of new ground where every third picture is one, and
+0.2 MB each at 1200 features."""
+MOST_AT_ONCE = 2
+"""More than come, so that a map which was joined is put away, too."""
+OF_FEATURES = (
+    "pixels", "normalised", "octaves", "angles_deg", "descriptors", "sigma_px", "whitening",
+)  # fmt: skip
+
+
+class ArrayFile(Protocol):
+    """Keeps arrays that are seldom read, and never written to."""
+
+    def put(self, arrays: Sequence[Any]) -> list[Any] | None:
+        """Equal arrays, which are read from the file as they are used; None where it is full."""
+
+
+def leave_behind(slam_map: SlamMap, file: ArrayFile | None, map_lock: MapLock) -> None:
+    """Put away what is left behind, the newest first, with the lock held but for the writing."""
+    for key in list(islice(reversed(slam_map.keyframes), N_NEAR, N_NEAR + MOST_AT_ONCE)):
+        keyframe = slam_map.keyframes[key]
+        if keyframe.is_far:
+            return
+        slam_map.leave_behind(keyframe)
+        _, points = slam_map.observations_of(keyframe)
+        points = np.unique(points[slam_map.patch_at[points] > NO_PATCH])
+        features = keyframe.features
+        arrays = (
+            *(getattr(features, name) for name in OF_FEATURES), keyframe.normalised,
+            keyframe.whitening, keyframe.refined_for, slam_map.patches_of(points).grey,
+        )  # fmt: skip
+        with map_lock.released():  # only mapping changes old keyframes and patches of their points
+            kept = None if file is None else file.put(arrays)
+        if kept is None:
+            continue
+        *of_features, keyframe.normalised, keyframe.whitening, keyframe.refined_for, grey = kept
+        keyframe.features = replace(features, **dict(zip(OF_FEATURES, of_features, strict=True)))
+        slam_map.put_patches_away(points, grey)
