@@ -327,7 +327,7 @@ def no_position(why_not: str) -> PilotText:
 
 
 def position_lost(why_not: str) -> PilotText:
-    """Text for the end of poses, by a reason of `companion.estimation.gate.pose_gate`."""
+    """Text for the end of poses, by a reason of `companion.estimation.gate`."""
     if why_not in SWITCHED_OFF:
         return POSITION_OFF()
     return POSITION_LOST(reason=REASONS.get(why_not, OTHER_REASON))

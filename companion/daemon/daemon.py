@@ -42,9 +42,9 @@ from companion.messages import (
     Odometry,
     Warned,
 )
+from companion.messages.run_facts import RunFacts
 from companion.meters import LatencyMeter
 from companion.pilot_messages import PilotText, of_warning
-from companion.products.flight_result import RunFacts
 from companion.runtime.stage_protocol import ResultsWritten, Snapshot
 from companion.runtime.stage_start import Start
 from companion.telemetry import (

@@ -13,7 +13,7 @@ import sqlite3  # noqa: F401
 import zipfile  # noqa: F401
 
 import companion.geometry.pose_table
-import companion.products.surroundings
+import companion.products.versions
 import companion.streaming.scene_encoder  # noqa: F401
 import drivers.mavlink.wire.packet_stream
 import drivers.recording.flights_folder

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Generator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from companion.config import MEASUREMENTS, Measurement
 from companion.dense.local_scale import local_scale_of_points
-from companion.geometry.camera import Camera
-from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import (
-    ClockReport,
     DepthMap,
     Frame,
     Georeference,
@@ -42,31 +38,6 @@ POSITION_STEP_NS = 100_000_000
 VOXEL_PER_DEPTH = 0.01
 """Voxel size over the median depth, without a metric scale."""
 GIVEN_UP = "points were given up, as the disk does not take them"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RunFacts:
-    """Facts of a run beside its messages; `stage_times` is `StageTimes.summary()`.
-
-    `origin` is the geodetic origin of local NED. `completed` is False when the run was stopped.
-    """
-
-    stage_times: Mapping[str, Mapping[str, float]]
-    wall_s: float
-    clock: ClockReport | None
-    origin: GeoOrigin | None
-    device: str
-    config: Mapping[str, Any]
-    versions: Mapping[str, str]
-    command: str
-    peak_memory_mb: float
-    camera: Camera
-    n_frames_total: int
-    completed: bool
-    dropped: Mapping[str, int] = field(default_factory=dict)
-    rates_hz: Mapping[str, float] = field(default_factory=dict)
-    believed: tuple[Measurement, ...] = MEASUREMENTS
-    """Telemetry that could decide about the pose, by `telemetry.use`."""
 
 
 class WorldPose(NamedTuple):

@@ -1,4 +1,7 @@
-"""Message queue of bounded size: on overflow messages are dropped by kind, and counted."""
+"""Message queue of bounded size: on overflow messages are dropped by kind, and counted.
+
+Or, where all are wanted, whoever has another waits for room.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,8 @@ GATHERED = DropPolicy.LOSSLESS
 class Mailbox(Generic[T]):
     """Queue of messages, at most `capacity_bytes` of them; may be used from any thread.
 
-    A message larger than that is let in when nothing else is there that could be dropped.
+    A message larger than that is let in when nothing else is there that could be dropped. With
+    `waits` nothing is dropped: `put` waits for room.
     """
 
     def __init__(
@@ -41,9 +45,10 @@ class Mailbox(Generic[T]):
         policy_of: Callable[[T], DropPolicy],
         bytes_of: Callable[[T], int],
         capacity_bytes: int,
+        waits: bool = False,
     ) -> None:
         self._policy_of, self._bytes_of = policy_of, bytes_of
-        self._capacity_bytes = capacity_bytes
+        self._capacity_bytes, self._is_lossless = capacity_bytes, waits
         self._waiting: dict[DropPolicy, deque[tuple[int, int, T]]] = {
             policy: deque() for policy in DropPolicy
         }
@@ -62,9 +67,11 @@ class Mailbox(Generic[T]):
         """Other messages dropped on overflow."""
 
     def put(self, message: T) -> None:
-        """Add a message; never waits. Counted as dropped once it is closed."""
+        """Add a message; see `waits`. Counted as dropped once it is closed."""
         policy, size = self._policy_of(message), self._bytes_of(message)
         with self._changed:
+            if self._is_lossless:
+                self._changed.wait_for(lambda: self._closed or self._has_room(size))
             if self._closed:
                 self.n_overflowed += 1
                 return
@@ -77,7 +84,7 @@ class Mailbox(Generic[T]):
             while self.n_bytes > self._capacity_bytes and self._drop_lowest():
                 self.n_overflowed += 1
             if not self._pauses or policy is not GATHERED or self.n_bytes > self._gather_bytes:
-                self._changed.notify()
+                self._changed.notify_all()
 
     def get(self) -> T | None:
         """Oldest message; waits for one. None once it is closed and empty."""
@@ -111,6 +118,8 @@ class Mailbox(Generic[T]):
                 taken.append(message)
                 if policy is not GATHERED:
                     break
+            if self._is_lossless:
+                self._changed.notify_all()
             return taken
 
     @property
@@ -126,6 +135,9 @@ class Mailbox(Generic[T]):
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+
+    def _has_room(self, size: int) -> bool:
+        return not self.n_bytes or self.n_bytes + size <= self._capacity_bytes
 
     def _has_any(self) -> bool:
         return any(self._waiting.values())

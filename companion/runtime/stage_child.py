@@ -22,25 +22,32 @@ for variable in (
 os.environ.setdefault("OPENCV_OPENCL_RUNTIME", "disabled")
 
 import threading  # noqa: E402
+import traceback  # noqa: E402
 from collections.abc import Callable  # noqa: E402
+from dataclasses import replace  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
-from companion.errors import CompanionError, InputError  # noqa: E402
 from companion.messages import Frame  # noqa: E402
 from companion.runtime.mailbox import Mailbox  # noqa: E402
 from companion.runtime.parcel import Parcel  # noqa: E402
+from companion.runtime.peak_memory import peak_memory_mb  # noqa: E402
 from companion.runtime.stage_protocol import (  # noqa: E402
     Failed,
     Finish,
     Finished,
     Progress,
-    Remark,
     Setup,
     Taken,
 )
 from companion.runtime.stage_work import Work, WorkModule, module_of  # noqa: E402
-from companion.runtime.stages import Stage, drop_policy, stage_named  # noqa: E402
+from companion.runtime.stages import (  # noqa: E402
+    NICE_WITHOUT_LOSS,
+    Stage,
+    drop_policy,
+    lossless,
+    stage_named,
+)
 from companion.runtime.uncollected import uncollected  # noqa: E402
 from companion.timing.clock import monotonic_s, wait_s  # noqa: E402
 
@@ -48,7 +55,7 @@ IN_BYTES = 64 << 20
 """Queue in a stage's process: fifty frames of 640x480."""
 REPORT_EVERY_S = 1.0
 LOWEST_NICE = 19
-"""Lowest priority: runs only where nothing else wants the processor."""
+"""Lowest priority of all: runs only where nothing else wants the processor."""
 SWITCH_S = 5e-4
 """Switch interval of the interpreter, so that background threads yield to the tracker."""
 
@@ -62,11 +69,9 @@ def run(name: str, descriptor: int) -> int:
     """Run one stage until told to finish, or until the daemon is gone; the exit status."""
     Path("/proc/self/comm").write_text(name, "utf-8")  # its name in top and ps
     stage = stage_named(name)
-    os.nice(min(stage.nice, LOWEST_NICE))
+    os.nice(min(stage.nice, NICE_WITHOUT_LOSS))
     if stage.nice == 0:
         _take_real_time()
-    if stage.nice > LOWEST_NICE:
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     sys.setswitchinterval(SWITCH_S)
     daemon = socket.socket(fileno=descriptor)
     module = imported(stage.name)  # which takes a second, and may be long before there is a flight
@@ -76,10 +81,17 @@ def run(name: str, descriptor: int) -> int:
     except EOFError:
         return 0
     send = _sender(daemon)
+    if setup.is_live:
+        _stand_back(stage)
+    else:
+        stage = lossless(stage)
     try:
         _serve(daemon, send, stage, module, setup)
-    except (CompanionError, OSError) as error:  # no device, no room on the disk: no bug of ours
-        send(Failed(str(error), isinstance(error, InputError)))
+    except BaseException as error:
+        failed = Failed.by(error)
+        if not failed.is_foreseen:
+            traceback.print_exc()
+        send(failed)
         return 1
     return 0
 
@@ -98,22 +110,23 @@ def _serve(
 ) -> None:  # fmt: skip
     work = module.work(setup)
     work.begin(send)
-    loop = _Loop(stage, work)
+    loop = _Loop(stage, work, waits=not setup.is_live)
     send(loop.progress())
     threading.Thread(target=loop.read, args=(daemon, send), daemon=True).start()
     threading.Thread(target=loop.report, args=(send,), name="reports", daemon=True).start()
     loop.run(send)
+    send(loop.progress())
     send(Finished(work.times.summary(), work.device))
 
 
 class _Loop:
     """Processes one message after the other, and reports progress, also of a step that hangs."""
 
-    def __init__(self, stage: Stage, work: Work) -> None:
+    def __init__(self, stage: Stage, work: Work, waits: bool) -> None:
         self._work = work
         self._inbox: Mailbox[Parcel] = Mailbox(
             lambda parcel: drop_policy(stage, parcel.kind, in_daemon=False),
-            lambda parcel: parcel.n_bytes, IN_BYTES,
+            lambda parcel: parcel.n_bytes, IN_BYTES, waits,
         )  # fmt: skip
         self._n_done = 0
         self._busy_since_s: float | None = None
@@ -139,10 +152,11 @@ class _Loop:
 
     def progress(self) -> Progress:
         """Progress now."""
-        inbox, work = self._inbox, self._work
-        return Progress(
-            self._n_done, inbox.n_dropped + inbox.n_overflowed + work.n_rejected,
-            self._busy_since_s, inbox.n_bytes, work.times.summary(), work.device, work.details(),
+        inbox, own = self._inbox, self._work.progress
+        return replace(
+            own, n_done=self._n_done, busy_since_s=self._busy_since_s, waiting_bytes=inbox.n_bytes,
+            n_dropped=inbox.n_dropped + inbox.n_overflowed + own.n_dropped,
+            peak_memory_mb=peak_memory_mb(),
         )  # fmt: skip
 
     def report(self, send: Callable[[Any], None]) -> None:
@@ -170,6 +184,14 @@ class _Loop:
             self._n_done += isinstance(message, Frame)
 
 
+def _stand_back(stage: Stage) -> None:
+    """Take the lowest priorities, which a flight's path needs, but nobody who waits for all."""
+    if stage.nice > NICE_WITHOUT_LOSS:
+        os.nice(min(stage.nice, LOWEST_NICE) - NICE_WITHOUT_LOSS)
+    if stage.nice > LOWEST_NICE:
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+
+
 def _take_real_time() -> None:
     """Real-time priority for the pose, if the service's LimitRTPRIO and a spare core allow it.
 
@@ -187,9 +209,6 @@ def _sender(daemon: socket.socket) -> Callable[[Any], None]:
     lock = threading.Lock()
 
     def send(message: Any) -> None:
-        if isinstance(message, Remark):
-            print(f"companion: {message.text}", file=sys.stderr, flush=True)
-            return
         parcel = Parcel.of(message)
         try:
             with lock:

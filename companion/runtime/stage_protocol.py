@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from companion.config import Config
+from companion.errors import CompanionError, InputError, StageError
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
-from companion.products.flight_result import RunFacts
+from companion.messages.run_facts import RunFacts
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +21,8 @@ class Setup:
     """First message to a stage; those that begin with the flight get its folder.
 
     `origin` is that of local NED where it is known before the flight, as in a recorded one, and
-    `is_live` whether the flight is flown just now: then no frame waits for mapping.
+    `is_live` whether the flight is flown just now: then no frame waits for mapping, and a queue
+    that is full drops; else nothing is lost.
     """
 
     config: Config
@@ -132,6 +136,8 @@ class Progress:
     times: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     device: str = ""
     details: Mapping[str, Any] = field(default_factory=dict)
+    peak_memory_mb: float = 0.0
+    """Of a process that has only this stage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,10 +174,34 @@ class DriverAtWork:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """The stage cannot do its work and ends: the reason, and whether user input is to blame."""
+    """The stage cannot do its work and ends: the reason, and whether user input is to blame.
+
+    `is_foreseen` is False for a bug. `pickled` is the exception, None where it cannot be pickled.
+    """
 
     why: str
     by_input: bool = False
+    is_foreseen: bool = True
+    pickled: bytes | None = None
+
+    @classmethod
+    def by(cls, error: BaseException) -> Failed:
+        """Told of an exception."""
+        is_foreseen = isinstance(error, CompanionError | OSError)
+        why = str(error) if is_foreseen else f"{type(error).__name__}: {error}"
+        pickled = None
+        with contextlib.suppress(Exception):  # some cannot be, and say so in any way
+            whole = pickle.dumps(error)
+            pickle.loads(whole)
+            pickled = whole
+        return cls(why, isinstance(error, InputError), is_foreseen, pickled)
+
+    def error(self) -> BaseException:
+        """The exception, or one with its text."""
+        if self.pickled is None:
+            return StageError(self.why)
+        found: BaseException = pickle.loads(self.pickled)
+        return found
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
 from companion.messages import Frame, Message
-from companion.runtime.stage_protocol import Finish, ResultsWritten, Setup, Snapshot
+from companion.runtime.stage_protocol import Finish, Progress, ResultsWritten, Setup, Snapshot
 from companion.timing.clock import StageTimes
 
 
@@ -30,6 +30,14 @@ class Work(ABC):
     def details(self) -> Mapping[str, Any]:
         """Facts for its progress report, beside those that all stages have."""
         return {}
+
+    @property
+    def progress(self) -> Progress:
+        """Progress now."""
+        return Progress(
+            n_dropped=self.n_rejected, times=self.times.summary(), device=self.device,
+            details=self.details(),
+        )  # fmt: skip
 
     def begin(self, tell: Callable[[Any], None]) -> None:  # noqa: B027 - most have nothing to do
         """Called before the first message; `tell` sends a message to the daemon at once."""

@@ -7,7 +7,7 @@ listens to stages above it only. The work of a stage is in `companion.stages.<na
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from companion.flight_notes import GateStep, HealthNote, LinkReads
@@ -127,6 +127,9 @@ STAGES = (
         nice=10, answer_s=180.0, finish_s=180.0, hurried_s=1.6, with_flight=True, in_folder=True,
     ),
 )  # fmt: skip
+NICE_WITHOUT_LOSS = 10
+"""Lowest priority where nothing may be lost: beside nice 0 a tenth of a core that both want, and
+all that is left."""
 START_S = 300.0
 """Longest start of a stage. On an overloaded computer the imports alone take a minute and more, and
 the first start of all compiles loops or kernels."""
@@ -152,6 +155,11 @@ def drop_policy(stage: Stage, kind: str, in_daemon: bool) -> DropPolicy:
     if kind == Frame.__name__ and replaced:
         return DropPolicy.LATEST_WINS
     return DROPPED.get(kind, DropPolicy.LOSSLESS)
+
+
+def lossless(stage: Stage) -> Stage:
+    """The same row where nobody is too slow: it wants every frame."""
+    return replace(stage, frames=Frames.EVERY)
 
 
 def stage_named(name: str) -> Stage:

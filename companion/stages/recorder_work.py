@@ -8,7 +8,7 @@ from typing import Any
 from companion.errors import StageError
 from companion.flight_notes import LinkReads
 from companion.messages import Message
-from companion.products.surroundings import versions
+from companion.products.versions import versions
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stage_work import Work
 from drivers.recording.recorder import Recorder

@@ -9,7 +9,8 @@ from typing import Any
 
 from companion.errors import StageError
 from companion.messages import Message, PointChunk
-from companion.products.flight_result import FlightResult, RunFacts
+from companion.messages.run_facts import RunFacts
+from companion.products.flight_result import FlightResult
 from companion.runtime.stage_protocol import (
     Finish,
     ResultsWritten,

@@ -33,7 +33,7 @@ from companion.app.replay.poses_sent import PosesSent
 from companion.config_file import load_config
 from companion.estimation.body.aiding import Model
 from companion.estimation.body.body_state import BodyState
-from companion.estimation.gate.pose_gate import PoseToSend
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.localisation import LocalisationStage
 from companion.geometry.transforms import Array
 from companion.messages import Odometry

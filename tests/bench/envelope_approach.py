@@ -15,7 +15,7 @@ import argparse
 
 import numpy as np
 
-from companion.estimation.gate.pose_gate import PoseToSend
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.tracking_margin import TOO_FAINT, TOO_FAST, TOO_FEW
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose

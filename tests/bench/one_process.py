@@ -40,8 +40,8 @@ from companion.daemon.flights.live_flight import Listener, LiveFlight
 from companion.daemon.health_watch import HealthWatch
 from companion.geometry.camera import Camera
 from companion.messages import DepthMap, Frame, MapUpdate, Odometry, PointChunk, Track, Warned
+from companion.messages.run_facts import RunFacts
 from companion.meters import LatencyMeter
-from companion.products.flight_result import RunFacts
 from companion.runtime.fork_server import ForkServer
 from companion.telemetry import Telemetry
 from companion.timing.clock import FlightClock

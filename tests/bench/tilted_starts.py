@@ -17,7 +17,7 @@ import numpy as np
 
 from companion.config import Config
 from companion.estimation.attitude.attitude_history import AttitudeHistory
-from companion.estimation.gate.pose_gate import MAX_TILT_ERROR_RAD
+from companion.estimation.gate.pose_rules import MAX_TILT_ERROR_RAD
 from companion.estimation.localisation import LocalisationStage
 from companion.messages import Frame, Odometry, TrackState, Warned
 from companion.runtime.in_order import in_order_of_time

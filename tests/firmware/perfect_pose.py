@@ -10,7 +10,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.estimation.gate.pose_gate import PoseToSend
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Pose, rotation_from_quaternion
 from drivers.mavlink.measurements.pose_messages import odometry_message

@@ -15,7 +15,7 @@ from companion.daemon.control.flight_parameters import PARAMETERS
 from companion.daemon.flights import live_flight, recording_recovery, viewing
 from companion.daemon.pose import pose_sender
 from companion.estimation import map_resumption
-from companion.estimation.gate import pose_gate
+from companion.estimation.gate import pose_gate, pose_rules
 from companion.estimation.inertial import imu_verdict
 from companion.estimation.shutter import shutter_of_frames
 from companion.messages import Warned
@@ -117,7 +117,7 @@ def phrases(module: object) -> set[str]:
 
 def test_every_reason_has_its_words() -> None:
     known = {*REASONS, *pilot_messages.SWITCHED_OFF}
-    assert phrases(pose_gate) <= known
+    assert phrases(pose_gate) | phrases(pose_rules) <= known
     assert {pose_sender.UNHEARD, pose_sender.SWITCHED_OFF} <= known
     assert position_lost("quality too low").text == "Companion: vision position lost: low quality"
     assert position_lost("switched off").text == "Companion: vision position off: ground command"

@@ -28,9 +28,9 @@ from companion.geometry.transforms import (
 )
 from companion.messages import Frame, Odometry, Track, TrackState
 from companion.products.flight_result import FlightResult
-from companion.products.surroundings import peak_memory_mb
 from companion.products.trajectory_error import Path, path_errors
 from companion.runtime.in_order import in_order_of_time
+from companion.runtime.peak_memory import peak_memory_mb
 from companion.timing.clock import StageTimes
 from drivers.flight import Flight, TruePose
 from drivers.open_flight import open_flight

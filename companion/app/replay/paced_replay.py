@@ -14,7 +14,7 @@ from companion.daemon.flights.flight_facts import facts_of
 from companion.daemon.flights.live_flight import Listener, LiveFlight
 from companion.errors import StageError
 from companion.messages import Frame, FrameOverdue, Odometry, Warned
-from companion.products.flight_result import RunFacts
+from companion.messages.run_facts import RunFacts
 from companion.runtime.fork_server import ForkServer
 from companion.runtime.stages import START_S
 from companion.telemetry import Telemetry

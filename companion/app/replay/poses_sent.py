@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from companion.config import Config
-from companion.estimation.gate.pose_gate import PoseGate, PoseToSend
+from companion.estimation.gate.pose_gate import PoseGate
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.messages import Message, Odometry
 from companion.products.atomic_file import write_atomically
 from companion.products.trajectory_file import sent_poses_tum

@@ -25,9 +25,9 @@ from companion.messages import (
     TrackState,
     Warned,
 )
-from companion.products.flight_result import RunFacts
+from companion.messages.run_facts import RunFacts
 from companion.products.site_map_file import map_path, read_head
-from companion.products.surroundings import peak_memory_mb, versions
+from companion.products.versions import versions
 from companion.runtime.gaps import with_gap_warnings
 from companion.runtime.in_order import InOrder, in_order_of_time, in_words
 from companion.runtime.stage_protocol import Finish, SaveSiteMap, Setup
@@ -142,8 +142,7 @@ def replay(
             live.take(message)
 
     with ExitStack() as stack:
-        stages = InOrder(map(stage_named, names), setup, watch, notify, forked=("depth", "results"))
-        depth = stages.works.get("depth")
+        stages = InOrder(map(stage_named, names), setup, watch, notify, apart=("depth", "results"))
         began_s = monotonic_s()
         completed = False
 
@@ -159,9 +158,9 @@ def replay(
             return Finish(hurry=False, facts=RunFacts(
                 stage_times=stages.times, wall_s=monotonic_s() - began_s, clock=log.clock,
                 origin=watched.origin(log.origin, of_map),
-                device=depth.device if depth is not None else NO_DEPTH,
+                device=stages.progress("depth").device if config.depth.enabled else NO_DEPTH,
                 config=shown(config), versions=versions(), command=command_shown(sys.argv),
-                peak_memory_mb=peak_memory_mb(), camera=camera, n_frames_total=given.n_frames,
+                peak_memory_mb=stages.peak_memory_mb, camera=camera, n_frames_total=given.n_frames,
                 completed=completed, dropped=dropped, rates_hz=dict(log.rates_hz),
                 believed=config.telemetry.use,
             ))  # fmt: skip
@@ -189,8 +188,8 @@ def replay(
                 sent.write(out)
                 if landing is not None:
                     landing.write(out)
-    if depth is not None and depth.details()["failures"]:
-        notify(f"dense map: {depth.device}")
+    if config.depth.enabled and stages.progress("depth").details["failures"]:
+        notify(f"dense map: {stages.progress('depth').device}")
     if stages.depth_fault is not None:
         raise StageError(
             f"the dense map failed after {watched.n_depth_maps} depth maps: "

@@ -30,8 +30,8 @@ from companion.estimation.gate.gates_again import (
     SourceSet,
 )
 from companion.estimation.gate.global_gate import GlobalToSend
-from companion.estimation.gate.pose_gate import PoseToSend
 from companion.estimation.gate.pose_journal import PoseGateAgain
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.landing.landing_gate import TargetToSend
 from companion.flight_notes import GateStep
 from companion.messages import LandingTarget, Odometry, OpticalFlow

@@ -10,8 +10,9 @@ from companion.config_file import command_shown, shown
 from companion.daemon.flights.live_flight import LiveFlight
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import ClockReport
-from companion.products.flight_result import RunFacts
-from companion.products.surroundings import peak_memory_mb, versions
+from companion.messages.run_facts import RunFacts
+from companion.products.versions import versions
+from companion.runtime.peak_memory import peak_memory_mb
 
 
 def facts_of(

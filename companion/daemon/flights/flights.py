@@ -15,7 +15,7 @@ from companion.daemon.flights.live_flight import Listener, LiveFlight
 from companion.flight_notes import FlightNote
 from companion.geometry.camera import Camera
 from companion.messages import Frame, FrameOverdue, Warned
-from companion.products.flight_result import RunFacts
+from companion.messages.run_facts import RunFacts
 from companion.products.newest_file import NewestFile
 from companion.runtime.stage_protocol import KeepMap
 from companion.runtime.stage_start import Start

@@ -29,10 +29,11 @@ from companion.messages import (
     Track,
     Warned,
 )
-from companion.products.flight_result import RunFacts
+from companion.messages.run_facts import RunFacts
 from companion.runtime.parcel import Parcel
 from companion.runtime.processes import Processes, Supervisor, in_words
-from companion.runtime.stage_process import GATHER_S, StageProcess
+from companion.runtime.stage_outbox import GATHER_S
+from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import (
     Finish,
     KeepMap,

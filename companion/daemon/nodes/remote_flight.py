@@ -13,9 +13,10 @@ from companion.daemon.nodes.kept_chunks import KeptChunks
 from companion.daemon.nodes.remote_viewing import RemoteViewing
 from companion.geometry.camera import Camera
 from companion.messages import DepthMap, MapUpdate, Message, PointChunk, Warned
-from companion.products.flight_result import RunFacts
-from companion.products.surroundings import peak_memory_mb, versions
+from companion.messages.run_facts import RunFacts
+from companion.products.versions import versions
 from companion.runtime.in_order import InOrder
+from companion.runtime.peak_memory import peak_memory_mb
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stages import Stage, stage_named
 from companion.timing.clock import monotonic_s
@@ -104,7 +105,7 @@ class RemoteFlight:
     def _facts(self) -> RunFacts:
         return RunFacts(
             stage_times=self._stages.times, wall_s=monotonic_s() - self._began_s, clock=None,
-            origin=None, device=self._stages.works["depth"].device, config=shown(self._config),
+            origin=None, device=self._stages.progress("depth").device, config=shown(self._config),
             versions=versions(), command=command_shown(sys.argv),
             peak_memory_mb=peak_memory_mb(), camera=self.camera, n_frames_total=self._n_frames,
             completed=True, dropped={"bundles": self.n_missed},

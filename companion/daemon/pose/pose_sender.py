@@ -12,8 +12,9 @@ from pathlib import Path
 
 from companion.config import FeedbackConfig, Measurement
 from companion.daemon.pose.sent_counter import SentCounter
-from companion.estimation.gate.pose_gate import PoseToSend, Sending
+from companion.estimation.gate.pose_gate import Sending
 from companion.estimation.gate.pose_journal import JournaledPoseGate
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.gate.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
 from companion.health import FeedbackHealth

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.config import FeedbackConfig, Measurement
-from companion.estimation.gate.pose_gate import PoseToSend
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned
 from companion.geometry.transforms import Array
 from companion.messages import Georeference

@@ -1,19 +1,17 @@
 """Gate of poses sent to the autopilot.
 
-A pose must be metric, tracked, certain, of sufficient quality, level by the autopilot's own
-attitude, and recent. What cannot be checked is not sent. All conditions must hold for a while
-before the first pose is sent; gaps shorter than an autopilot's timeout are bridged by prediction,
-and longer ones by inertial dead reckoning for as long as its standard deviation is within the
-limit. After others, and after every discontinuity, the conditions must hold again: after a pause
-in which no frame came and none was refused for as long as the pause, after others for the whole
-time.
+Each must keep the rules (`pose_rules`). They must be kept for a while before the first pose is
+sent; gaps shorter than an autopilot's timeout are bridged by prediction, and longer ones by
+inertial dead reckoning for as long as its standard deviation is within the limit. After others, and
+after every discontinuity, the rules must be kept again: after a pause in which no frame came and
+none was refused for as long as the pause, after others for the whole time.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 from statistics import median
 
@@ -21,48 +19,34 @@ import numpy as np
 
 from companion.config import MEASUREMENTS, FeedbackConfig, Measurement
 from companion.estimation.attitude.attitude_history import MAX_EXTRAPOLATION_NS, AttitudeHistory
+from companion.estimation.gate.pose_rules import (
+    NO_ATTITUDE,
+    UNCERTAIN,
+    Before,
+    rejection_reason,
+    sigma_place_m,
+)
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.gate.reset_counter import ResetCounter
-from companion.geometry.transforms import Array, Pose
-from companion.messages import Odometry, TrackState
+from companion.geometry.transforms import Pose
+from companion.messages import Odometry
 from companion.telemetry import AttitudeSample, is_believed
 
-MAX_TILT_ERROR_RAD = np.radians(8.0)
-MAX_AGE_NS = 300_000_000
-"""An older pose is of no use to an autopilot."""
 MAX_PAUSE_NS = 3_000_000_000
 """After frames that came too late, dead reckoning begins again within this time, with proof: a
 computer that was busy for a moment has lost nothing of where the body is."""
-MAX_SIGMA_SCALE = 0.05
-"""Relative; with it velocities are 5 % off, 0.5 m/s at 10 m/s, which an autopilot's EKF takes for
-noise: ArduPilot's VISO_VEL_M_NSE is 0.1 m/s and more, its innovation gates are five of these."""
-SIGMA_ACCELERATION_M_S2 = 3.0
-"""Of a vehicle between two frames, whose velocity a prediction holds: 17 degrees of tilt."""
-HYSTERESIS = 0.8
-"""To start sending, a pose must be better than the limits by this factor."""
-MAX_EXTENT_M = 1e5
 MIN_SPACING_NS = 4_000_000
 N_PERIODS = 20
 MAX_ATTITUDE_GAP_NS = 2 * MAX_EXTRAPOLATION_NS
 """Between two attitude samples: no time is further from one than extrapolation reaches."""
 
 NOT_YET = "no pose yet"
-INITIALISING = "initialising"
-LOST = "lost"
-NO_SCALE = "no metric scale"
-SCALE_UNCERTAIN = "scale too uncertain"
-UNPROVED_IMU = "IMU being checked"
-UNCERTAIN = "position too uncertain"
-POOR = "quality too low"
-TILTED = "tilt differs from the autopilot's"
-LATE = "poses come too late"
 SILENT = "no frames"
-NO_ATTITUDE = "no autopilot attitude"
 NOT_BELIEVED = "attitude is not believed"
 RESTARTED = "localisation begins anew"
 RESET = "position reset"
 REBOOTED = "autopilot rebooted"
 NO_HEIGHT = "no autopilot height"
-NO_MOUNT = "camera mount is not known"
 PROVING = "belief must hold first"
 
 
@@ -74,25 +58,6 @@ class Sending(Enum):
     SENDING = "sending"
     BRIDGING = "bridging"
     """Sent by inertial dead reckoning: nothing is tracked."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseToSend:
-    """A pose for the autopilot at `t_ns`, in NED-aligned metres; see Odometry.
-
-    Its down axis may be offset against that of an Odometry, to start at that of the autopilot.
-    """
-
-    t_ns: int
-    world_from_body: Pose
-    velocity_world_m_s: Array
-    sigma_position_m: float
-    sigma_velocity_m_s: float
-    sigma_attitude_rad: float
-    sigma_yaw_rad: float
-    quality: int
-    reset_counter: int
-    predicted: bool = False
 
 
 class PoseGate:
@@ -264,42 +229,10 @@ class PoseGate:
         """Reason why a pose is rejected; "" if accepted."""
         if "attitude" not in self._use:
             return NOT_BELIEVED
-        pose, velocity = odometry.world_from_body, odometry.velocity_world_m_s
-        if odometry.state is TrackState.INITIALISING:
-            return INITIALISING
-        bridging = odometry.inertial and (self.sending or self._paused_lately(now_ns))
-        seen = odometry.state in (TrackState.TRACKING, TrackState.STANDING)
-        if not seen and not bridging:
-            return LOST
-        if pose is None and odometry.state is TrackState.STANDING:
-            return UNPROVED_IMU
-        if pose is None or velocity is None:
-            return NO_SCALE if self._accepted is None else LOST
-        parts = pose.rotation, pose.translation, velocity
-        if (
-            not all(np.isfinite(part).all() for part in parts)
-            or np.abs(pose.translation).max() > MAX_EXTENT_M
-            or not np.isfinite(odometry.sigma_velocity_m_s)  # the velocity is an old one
-        ):
-            return UNCERTAIN
-        if not np.isfinite(odometry.sigma_attitude_rad):
-            return NO_MOUNT
-        hysteresis = 1.0 if self.sending else HYSTERESIS
-        if not _sigma_place_m(odometry) <= hysteresis * self._config.max_sigma_m:
-            return UNCERTAIN
-        if not odometry.sigma_scale <= hysteresis * MAX_SIGMA_SCALE:
-            return SCALE_UNCERTAIN
-        if odometry.quality * hysteresis < self._config.min_quality and not bridging:
-            return POOR
-        if now_ns - odometry.t_ns > MAX_AGE_NS:
-            return LATE
+        may_bridge = self.sending or self._paused_lately(now_ns)
+        before = Before(self.sending, self._accepted is not None, may_bridge)
         attitude = self._attitude.at(odometry.t_ns)
-        if attitude is None:
-            return NO_ATTITUDE
-        cosine = float(np.clip(attitude[2] @ pose.rotation[2], -1.0, 1.0))
-        if not np.arccos(cosine) <= MAX_TILT_ERROR_RAD * hysteresis:
-            return TILTED
-        return ""
+        return rejection_reason(odometry, now_ns, attitude, before, self._config)
 
     def _start_sending(self, odometry: Odometry, now_ns: int) -> str:
         """Start sending with a proven pose; the reason where it may not."""
@@ -370,20 +303,12 @@ class PoseGate:
         if before is None or now is None:
             self._last_rejection = self._last_rejection or NO_ATTITUDE
             return None
-        pose = replace(self._pose_of(accepted), t_ns=accepted.t_ns + ahead_ns, predicted=True)
-        rotation = pose.world_from_body.rotation @ before.T @ now
-        ahead_s = ahead_ns * 1e-9
-        changed_m_s = SIGMA_ACCELERATION_M_S2 * ahead_s
-        grown_m = float(np.hypot(pose.sigma_velocity_m_s, 0.5 * changed_m_s)) * ahead_s
-        if not np.hypot(_sigma_place_m(accepted), grown_m) <= self._config.max_sigma_m:
+        pose = self._pose_of(accepted)
+        sigma_m = np.hypot(sigma_place_m(accepted), pose.grown_m(ahead_ns))
+        if not sigma_m <= self._config.max_sigma_m:
             self._last_rejection = self._last_rejection or UNCERTAIN
             return None
-        position = pose.world_from_body.translation + pose.velocity_world_m_s * ahead_s
-        return replace(
-            pose, world_from_body=Pose(rotation, position),
-            sigma_position_m=float(np.hypot(pose.sigma_position_m, grown_m)),
-            sigma_velocity_m_s=float(np.hypot(pose.sigma_velocity_m_s, changed_m_s)),
-        )  # fmt: skip
+        return pose.ahead(ahead_ns, before, now)
 
     def _stamped(self, pose: PoseToSend) -> PoseToSend | None:
         """The same, if its stamp is later than the last sent."""
@@ -391,11 +316,3 @@ class PoseGate:
             return None
         self._last_stamp_ns = pose.t_ns
         return pose
-
-
-def _sigma_place_m(odometry: Odometry) -> float:
-    """Standard deviation of the place apart from the scale.
-
-    A scale that is off shortens all ways alike, and no place where the body stands.
-    """
-    return float(np.sqrt(odometry.sigma_position_m**2 - odometry.sigma_by_scale_m**2))

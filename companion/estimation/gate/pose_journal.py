@@ -8,7 +8,8 @@ from typing import Any
 
 from companion.config import FeedbackConfig, Measurement
 from companion.estimation.gate.gate_journal import POSE, GateJournal
-from companion.estimation.gate.pose_gate import PoseGate, PoseToSend
+from companion.estimation.gate.pose_gate import PoseGate
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.gate.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
 from companion.messages import Odometry

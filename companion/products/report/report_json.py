@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from companion.messages import Track, TrackState
+from companion.messages.run_facts import RunFacts
 from companion.products.cloud import Cloud
-from companion.products.flight_result import FlightResult, RunFacts, WorldPose
+from companion.products.flight_result import FlightResult, WorldPose
 from companion.products.trajectory_file import exact_seconds
 
 

@@ -13,8 +13,9 @@ import numpy as np
 from markupsafe import Markup
 
 from companion.geometry.transforms import Array
+from companion.messages.run_facts import RunFacts
 from companion.products.cloud import Cloud
-from companion.products.flight_result import FlightResult, RunFacts, WorldPose
+from companion.products.flight_result import FlightResult, WorldPose
 from companion.products.report import plots
 from companion.products.report.cloud_scene import PlacedKeyframe, cloud_scene
 from companion.products.report.cloud_views import (

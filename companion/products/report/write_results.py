@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from companion.messages.run_facts import RunFacts
 from companion.products.atomic_file import write_atomically
 from companion.products.cloud_ply import ply_parts
-from companion.products.flight_result import FlightResult, RunFacts
+from companion.products.flight_result import FlightResult
 from companion.products.report.report_json import report, report_json
 from companion.products.report.report_page import report_page
 from companion.products.trajectory_file import trajectory_tum

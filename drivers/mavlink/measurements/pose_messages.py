@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.estimation.gate.pose_gate import PoseToSend
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.geometry.transforms import Array, quaternion_from_rotation
 from drivers.mavlink.vehicle import Firmware
 

@@ -21,7 +21,7 @@ from companion.messages import (
     TrackState,
     Warned,
 )
-from companion.products.flight_result import RunFacts
+from companion.messages.run_facts import RunFacts
 from companion.telemetry import PositionSample, PositionSource
 
 START_NS = 1_700_000_000_123_456_789

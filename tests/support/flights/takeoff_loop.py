@@ -19,7 +19,8 @@ import cv2
 import numpy as np
 
 from companion.config_file import load_config
-from companion.estimation.gate.pose_gate import PoseGate, PoseToSend
+from companion.estimation.gate.pose_gate import PoseGate
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.localisation import LocalisationStage
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import (

@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from companion.errors import CompanionError, InputError
+from companion.errors import CompanionError, DeviceError, InputError
 from companion.messages import Frame, MapUpdate
-from companion.runtime.stage_protocol import DriverAtWork, Finish, SetLoadLevel, Setup
+from companion.runtime.stage_protocol import DriverAtWork, Finish, Remark, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 from companion.runtime.stages import Death, Frames, Stage
 from companion.telemetry import ArmedSample
@@ -23,12 +23,18 @@ from companion.telemetry import ArmedSample
 UNUSABLE = "unusable"
 """Name of a folder of which no stage can make anything."""
 GIVEN_UP = "no room on the disk"
+ERRORS = {
+    "device": DeviceError("it is gone", "by what its driver says"),
+    "disk": OSError(28, "no room"),
+    "bug": KeyError("no such key"),
+    "not pickled": type("Local", (Exception,), {})("of no module"),
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Do:
-    """What a stage is to do: `say`, `hang`, `exit`, `crash`, `give up`, `drive`, or at its end
-    `be slow to finish`, `fail to finish`."""
+    """What a stage is to do: `say`, `say much`, `remark`, `hang`, `exit`, `crash`, `give up`,
+    `raise` one of `ERRORS`, `drive`, or at its end `be slow to finish`, `fail to finish`."""
 
     t_ns: int
     what: str
@@ -82,6 +88,12 @@ class TinyWork(Work):
     def _do(self, what: Do) -> Iterator[Any]:
         if what.what == "say":
             yield Said(what.t_ns, "told", what.detail)
+        elif what.what == "say much":
+            yield from [Said(what.t_ns, "told", what.detail * 20_000)] * 30
+        elif what.what == "remark":
+            self._tell(Remark(what.detail))
+        elif what.what == "raise":
+            raise ERRORS[what.detail]
         elif what.what == "hang":
             threading.Event().wait()
         elif what.what == "exit":

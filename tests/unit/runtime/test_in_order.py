@@ -15,12 +15,12 @@ from companion.messages import Frame, KeyframeAdded, Message, PointChunk, Track,
 from companion.runtime import in_order
 from companion.runtime.in_order import (
     DEPTH_FAILED,
-    DEPTH_QUEUE_BYTES,
     FRAMES_AHEAD,
     InOrder,
     in_order_of_time,
 )
 from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stage_thread import ROOM_BYTES
 from companion.runtime.stage_work import Work
 from companion.runtime.stages import stage_named
 from companion.telemetry import RangeSample
@@ -192,7 +192,7 @@ def test_whoever_feeds_waits_for_depth_and_nothing_is_lost(monkeypatch: pytest.M
 
     feeder = threading.Thread(target=feed)
     feeder.start()
-    n_room = DEPTH_QUEUE_BYTES // (4 * side * side)
+    n_room = ROOM_BYTES // (4 * side * side)
     with fed:
         assert fed.wait_for(lambda: n_fed >= n_room, 30)
     assert n_fed <= n_room + 2

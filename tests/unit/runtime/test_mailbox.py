@@ -23,6 +23,28 @@ def mailbox(room: int = 100) -> Mailbox[Sent]:
     return Mailbox(lambda sent: sent[0], lambda sent: sent[1], room)
 
 
+def test_where_nothing_may_be_lost_whoever_puts_waits_for_room() -> None:
+    box: Mailbox[Sent] = Mailbox(lambda sent: sent[0], lambda sent: sent[1], 100, waits=True)
+    box.put((DropPolicy.PICTURE, 1000, "larger than all room"))
+    names = [f"picture {number}" for number in range(50)]
+
+    def put() -> None:
+        for name in names:
+            box.put((DropPolicy.PICTURE, 40, name))
+
+    putter = threading.Thread(target=put)
+    putter.start()
+    taken: list[str] = []
+    while len(taken) < 50:
+        message = box.get()
+        assert message is not None and box.n_bytes <= 100
+        taken.append(message[2])
+    putter.join(30)
+    assert [*taken, *names_in(box)] == ["larger than all room", *names]
+    box.put((DropPolicy.PICTURE, 200, "too late"))
+    assert box.n_overflowed == 1, "and whoever waits for one that is closed does not for ever"
+
+
 def names_in(box: Mailbox[Sent]) -> list[str]:
     box.close()
     out = []
@@ -99,7 +121,7 @@ def test_small_messages_are_taken_together_and_all_in_their_order() -> None:
     for number, policy in enumerate(policies):
         box.put((policy, 10, str(number)))
     box.close()
-    taken = []
+    taken: list[str] = []
     while found := box.collect(30, 0.0):
         taken.append("".join(name for _, _, name in found))
     assert taken == ["0", "12", "3", "456", "7", "8", "9"]

@@ -17,7 +17,7 @@ import pytest
 
 from companion.config import Config
 from companion.messages import DepthMap, Frame
-from companion.runtime import stage_process, stage_start
+from companion.runtime import stage_outbox, stage_start
 from companion.runtime.parcel import Parcel
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import DriverAtWork, Finish, Progress, Setup
@@ -308,7 +308,7 @@ def test_whoever_has_a_message_for_localisation_sends_it(
     tiny = start(SOURCE)
     tiny.stage.begin(SETUP)
     tiny.until_up()
-    while not tiny.process._outbox.is_idle:
+    while not tiny.process._outbox._waiting.is_idle:
         threading.Event().wait(0.001)
     senders: list[threading.Thread] = []
     send = Parcel.send
@@ -331,7 +331,7 @@ def test_samples_for_localisation_gather_until_a_frame(
     tiny = start(SOURCE)
     tiny.stage.begin(SETUP)
     tiny.until_up()
-    while not tiny.process._outbox.is_idle:
+    while not tiny.process._outbox._waiting.is_idle:
         threading.Event().wait(0.001)
     packets: list[int] = []
     send_together = Parcel.send_together
@@ -341,14 +341,14 @@ def test_samples_for_localisation_gather_until_a_frame(
         send_together(parcels, to, flags)
 
     monkeypatch.setattr(Parcel, "send_together", counted)
-    monkeypatch.setattr(stage_process, "HELD_S", 60.0)
+    monkeypatch.setattr(stage_outbox, "HELD_S", 60.0)
     for n in range(70):
         tiny.stage.offer(Parcel.of(ArmedSample(n, True)))
     tiny.stage.offer(frame(7))
     assert packets == [64, 6, 1]
     tiny.heard.until_said("frame", "7")
     assert tiny.heard.texts("sample") == [str(n) for n in range(70)]
-    monkeypatch.setattr(stage_process, "HELD_S", 0.0)
+    monkeypatch.setattr(stage_outbox, "HELD_S", 0.0)
     tiny.stage.offer(Parcel.of(ArmedSample(70, True)))
     tiny.heard.until_said("sample", "70")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.estimation.gate.pose_gate import PoseToSend
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.geometry.transforms import Pose
 from companion.telemetry import AttitudeSample, ImuSample
 from tests.bench.consistency import KINDS, Truth, compare, told

@@ -7,7 +7,7 @@ import pytest
 
 from companion.config import Config
 from companion.estimation.gate.gate_journal import POSE as POSES
-from companion.estimation.gate.pose_gate import PoseToSend
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.geometry.transforms import Pose
 from drivers.mavlink.measurements.pose_messages import pose_messages
 from drivers.mavlink.vehicle import Firmware

@@ -10,8 +10,8 @@ import pytest
 
 from companion.config import MEASUREMENTS, FeedbackConfig, Measurement
 from companion.estimation.gate.gate_journal import POSE, given_again
-from companion.estimation.gate.pose_gate import PoseToSend
 from companion.estimation.gate.pose_journal import JournaledPoseGate, PoseGateAgain
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.gate.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion

@@ -18,7 +18,7 @@ from companion.estimation.gate.global_gate import (
     GlobalGate,
     GlobalToSend,
 )
-from companion.estimation.gate.pose_gate import PoseToSend
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.geometry.geodesy import GeoOrigin, ned_from_geodetic
 from companion.geometry.transforms import Pose, Similarity
 from companion.messages import Georeference

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from companion.config import FeedbackConfig, Measurement
-from companion.estimation.gate.pose_gate import PoseGate, PoseToSend, Sending
+from companion.estimation.gate.pose_gate import PoseGate, Sending
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
 from companion.messages import Odometry, TrackState
 from companion.telemetry import AttitudeSample

@@ -8,7 +8,8 @@ import pytest
 from companion.config import FeedbackConfig
 from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.camera_motion import ImageVelocity
-from companion.estimation.gate.pose_gate import PoseGate, PoseToSend
+from companion.estimation.gate.pose_gate import PoseGate
+from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.geometry.camera import Camera

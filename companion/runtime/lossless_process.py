@@ -1,0 +1,73 @@
+"""A stage in a process of its own of which nothing is lost: whoever feeds it waits for room."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from companion.errors import StageError
+from companion.runtime.parcel import Parcel
+from companion.runtime.stage_process import StageProcess
+from companion.runtime.stage_protocol import Finish, Progress, Setup
+from companion.runtime.stage_start import Start
+from companion.runtime.stages import Stage
+
+
+class LosslessProcess:
+    """A stage that takes all messages in order, and gives what it would give here; as StageThread.
+
+    What it gives waits until it is collected. A stage that raises ends: later messages are ignored,
+    earlier results can still be collected, and `fault` is the exception.
+    """
+
+    def __init__(self, stage: Stage, start: Start, say: Callable[[str], None]) -> None:
+        self._given: queue.SimpleQueue[Parcel] = queue.SimpleQueue()
+        self._process = StageProcess(
+            stage, start, self._given.put, lambda why: None, say, waits=True
+        )
+
+    def begin(self, setup: Setup) -> None:
+        """Wait until it has begun; what it raises is raised."""
+        self._process.begin(setup)
+        self._process.up_or_gone.wait()
+        if self.fault is not None:
+            raise self.fault
+
+    @property
+    def progress(self) -> Progress:
+        """Progress as it has last told."""
+        return self._process.progress or Progress()
+
+    @property
+    def fault(self) -> BaseException | None:
+        """Exception that has ended it; None without one."""
+        process = self._process
+        if not process.why or process.finished is not None:
+            return None
+        if process.failed is not None:
+            return process.failed.error()
+        return StageError(f"the process of {process.stage.name}: {process.why}")
+
+    def put(self, parcel: Parcel) -> None:
+        """Pass a message; waits for room."""
+        self._process.offer(parcel)
+
+    def collect(self) -> Iterator[Any]:
+        """Results so far."""
+        while True:
+            try:
+                yield self._given.get_nowait().open()
+            except queue.Empty:
+                return
+
+    def close(self, finish: Finish) -> list[Any]:
+        """Finish; the last results."""
+        self._process.ask_to_finish(finish)
+        self._process.wait()
+        self.kill()
+        return list(self.collect())
+
+    def kill(self) -> None:
+        """End it now."""
+        self._process.kill()
