@@ -254,12 +254,12 @@ def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Prog
                 n_fitted = len(gathered.views)
                 made = calibrate_lens(choose(gathered.views, MAX_VIEWS), covered.lit, model)
                 wanted = advice(gathered.views, covered, made)
-            if not wanted:
-                break
             # what to do is said where the board is seen well, else why it is not
             seen_well = problem in ("", "move the board")
             progress.show(**_facts(covered))
             progress.update(number, wanted if seen_well else problem, len(gathered.views))
+            if not wanted:
+                break
     except (KeyboardInterrupt, EndOfPictures):
         pass  # the views so far must suffice; if they do not, the reason is given
     finally:

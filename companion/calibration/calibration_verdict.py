@@ -87,13 +87,13 @@ def low_coverage(covered: Coverage) -> list[str]:
     out = []
     corners = covered.uncovered_corners()
     if corners:
-        out.append(
-            f"the board was never in the {_and(corners)} corner of the picture: show it there"
-        )
+        where = f"in the {_and(corners)} corner"
+        out.append(f"the board was never {where} of the picture: show it {where}")
     if covered.share < MIN_COVERAGE:
+        where = f"at the {covered.least_covered_edge()} edge"
         out.append(
             f"the board covered {covered.share:.0%} of the picture (at least {MIN_COVERAGE:.0%}), "
-            f"least at the {covered.least_covered_edge()} edge: show it there"
+            f"least {where}: show it {where}"
         )
     return out
 

@@ -84,17 +84,21 @@ MapOfBefore: Any = _own_message(
 
 @dataclass(frozen=True, slots=True)
 class _Json:
-    """JSON object: its name, description, and properties."""
+    """JSON object: its name, description, and properties.
+
+    Foxglove refuses a topic where a type is a list, an object has no properties, or items of an
+    array are arrays: what can be null is of the type that it has otherwise, and what is nested more
+    is not described.
+    """
 
     name: str
     says: str
     properties: Mapping[str, Any]
 
 
-NUMBER, TEXT, FLAG, OBJECT = {"type": "number"}, {"type": "string"}, {"type": "boolean"}, {
-    "type": "object"
-}  # fmt: skip
-NUMBERS = {"type": "array", "items": {"type": ["number", "null"]}}
+NUMBER, TEXT, FLAG = {"type": "number"}, {"type": "string"}, {"type": "boolean"}
+OBJECT: Mapping[str, Any] = {"type": "object", "properties": {}}
+NUMBERS = {"type": "array", "items": NUMBER}
 OBJECTS = {"type": "array", "items": OBJECT}
 INTEGER = {"type": "integer"}
 
@@ -145,7 +149,7 @@ TOPICS: dict[str, Any] = {
         {
             "seq": INTEGER, "n_samples": INTEGER, "mapping_point": INTEGER,
             "feature_ratio": NUMBER, "has_picture": FLAG,
-            "origin": {"type": ["array", "null"], "items": NUMBER},
+            "origin": NUMBERS,
         },
     ),
     GATES: _Json(
@@ -164,7 +168,7 @@ TOPICS: dict[str, Any] = {
         "normals of its face, body axes (FRD), metres; null where it is not seen",
         {
             "seq": INTEGER, "position_body_m": NUMBERS, "sigma_body_m": NUMBERS,
-            "normals_body": {"type": ["array", "null"]}, "size_px": NUMBER, "why_not": TEXT,
+            "size_px": NUMBER, "why_not": TEXT,
         },
     ),
     FLOW: _Json(

@@ -76,6 +76,7 @@ class RecordingRecovery:
         async for line in process.stdout:
             text = line.decode("utf-8", "replace").strip()
             self._warn(Warned(self._clock.now_ns(), CUT_SHORT, text))
+        await process.wait()  # to kill what ends by itself would take its status from the loop
 
 
 def _why_not_writable(folder: Path) -> str | None:

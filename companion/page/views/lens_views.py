@@ -57,7 +57,7 @@ class LensViews:
         name = next(each for each in names if not (folder / f"{each}.toml").exists())
         arguments = ["calibrate", "--running", "--json", "--name", name, "--out", str(folder)]
         self._work.begin(KIND, board, [*arguments, f"--board={board}"], lambda _: None)
-        return self._site.done(request, "/setup/lens", "Show the board to the camera.")
+        return self._site.done(request, "/setup/lens")
 
     async def _stop(self, request: Request, form: Form) -> Response:
         self._work.cancel(KIND)

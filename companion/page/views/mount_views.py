@@ -49,7 +49,7 @@ class MountViews:
         if self._work.is_busy:
             return await self._site.refused(request, self._work.busy_with, 409)
         self._work.begin(KIND, "the camera", ["mount", "--running", "--json"], lambda _: None)
-        return self._site.done(request, "/setup/mount", "Take the drone into your hands.")
+        return self._site.done(request, "/setup/mount")
 
     async def _stop(self, request: Request, form: Form) -> Response:
         self._work.cancel(KIND)
@@ -64,7 +64,7 @@ class MountViews:
             if stated is not None:
                 why = f"{stated} states a mount too: take body_from_camera out of it first."
                 return await self._site.refused(request, why, 409)
-            wanted = {f"mount.{name}": round(float(found[name]), 1) for name in ANGLES}
+            wanted = {f"mount.{name}": found[name] for name in ANGLES}
             return await self._settings.keep(request, "/setup", {"mount.known": True, **wanted})
         except CompanionError as error:
             return await self._site.refused(request, str(error), 409)
@@ -79,8 +79,12 @@ class MountViews:
         return path if read_calibration(path, *size).body_from_camera is not None else None
 
     def _found(self) -> dict[str, Any] | None:
+        """Result of the search, angles as they are shown and kept; None before there is one."""
         work = self._work.of(KIND)
-        return work.told if work is not None and work.state == "done" else None
+        if work is None or work.state != "done":
+            return None
+        angles = {name: round(float(work.told[name]), 1) + 0.0 for name in ANGLES}  # no -0.0
+        return work.told | angles
 
     def _values(self) -> dict[str, Any]:
         return {

@@ -101,10 +101,10 @@ class Site:
         missing = status_code == 404
         return await self.render(request, "refused.html.j2", status_code, why=why, missing=missing)
 
-    def done(self, request: Request, to: str, what: str, good: bool = True) -> Response:
-        """Go to a view, which says what was done."""
+    def done(self, request: Request, to: str, what: str = "", good: bool = True) -> Response:
+        """Go to a view, which says what was done unless it shows that by itself."""
         name = self.session(request).name
-        if name:
+        if name and what:
             self._said[name] = (what, good)
             if len(self._said) > MOST_SAID:
                 self._said.popitem(last=False)

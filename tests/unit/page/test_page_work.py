@@ -79,4 +79,5 @@ def test_the_board_on_the_page_is_the_one_that_is_looked_for() -> None:
         width, height = down.split("v")
         found.append([*map(float, place.split()), float(width), float(height)])
     wanted = chart.black_m() / chart.square_m * 100
-    assert np.allclose(np.array(found), wanted, atol=0.01)
+    # rows overlap, so that no browser leaves a white line between them
+    assert np.allclose(np.array(found), wanted, atol=0.02)
