@@ -29,6 +29,7 @@ from companion.estimation.body.body_state import (
     GROUND,
     N_STATE,
     BodyState,
+    carried_on,
     held,
     propagated,
 )
@@ -47,10 +48,8 @@ from companion.geometry.transforms import Array
 
 START = slice(VELOCITY.start, BIAS.stop)
 MAX_HELD_NS = 400_000_000
-"""Beyond the newest acceleration, the velocity is held for at most so long; and so late a
-measurement may come."""
-SIGMA_HELD_M_S2 = 3.0
-"""Acceleration that may have come since."""
+"""The newest acceleration is taken to stay for at most so long, and a velocity where there is none;
+and so late a measurement may come."""
 LEAST_MOVE = 1e-12
 """Of a frame, metres and radians: less is rounding."""
 REFUSED = {1: 10.83, 2: 13.82, 3: 16.27}
@@ -179,7 +178,9 @@ class BodyFilter:
         if t_ns - end_ns > MAX_HELD_NS or end_ns < self._state.t_ns:
             return None
         state = propagated(self._state, end_ns, self._integral)
-        return None if state is None else self._reckoned(state, t_ns)
+        if state is not None and t_ns > end_ns:
+            state = carried_on(state, t_ns, self._integral)
+        return None if state is None else self._reckoned(state)
 
     def moving(self, t_ns: int) -> Reckoned | None:
         """The same, with the velocity held where accelerations are missing.
@@ -192,25 +193,20 @@ class BodyFilter:
             return found
         if not 0 <= t_ns - self._state.t_ns <= MAX_HELD_NS:
             return None
-        return self._reckoned(held(self._state, t_ns), t_ns)
+        return self._reckoned(held(self._state, t_ns))
 
-    def _reckoned(self, state: BodyState, t_ns: int) -> Reckoned:
-        """Motion at a time by a state of it, or of shortly before."""
-        held_s, mean = (t_ns - state.t_ns) * 1e-9, state.mean
+    def _reckoned(self, state: BodyState) -> Reckoned:
+        """Motion by a state, at its time."""
+        mean = state.mean
         # accelerations that do not fit what is seen are stated as less certain
         unlikely = max(1.0, float(np.sqrt(self._normalised)))
-        sigma_m_s = state.sigma(VELOCITY)
-        sigma_v = unlikely * float(np.hypot(sigma_m_s, SIGMA_HELD_M_S2 * held_s))
-        moved_m = SIGMA_HELD_M_S2 * held_s * held_s / 2.0
-        sigma_p = unlikely * float(
-            np.linalg.norm([state.sigma(PLACE), moved_m, sigma_m_s * held_s])
-        )
-        covariance = unlikely**2 * state.covariance[START, START]
-        covariance[:3, :3] += (SIGMA_HELD_M_S2 * held_s) ** 2 * np.eye(3)
         velocity_ned_m_s = state.world_from_attitude.T @ mean[VELOCITY]
-        start = InertialStart(t_ns, velocity_ned_m_s, mean[BIAS].copy(), covariance)
-        place_m = mean[PLACE] + held_s * mean[VELOCITY]
-        return Reckoned(place_m, mean[VELOCITY].copy(), sigma_p, sigma_v, start)
+        covariance = unlikely**2 * state.covariance[START, START]
+        start = InertialStart(state.t_ns, velocity_ned_m_s, mean[BIAS].copy(), covariance)
+        return Reckoned(
+            mean[PLACE].copy(), mean[VELOCITY].copy(), unlikely * state.sigma(PLACE),
+            unlikely * state.sigma(VELOCITY), start,
+        )  # fmt: skip
 
     def _take_waiting(self) -> None:
         """Take all that does not wait for accelerations up to it which are about to come."""

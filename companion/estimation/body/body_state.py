@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral, Change
 from companion.estimation.inertial.inertial_motion import BIAS, PLACE, TILT, VELOCITY, motion
 from companion.geometry.transforms import Array
 
@@ -25,6 +25,8 @@ in seven minutes."""
 UNMEASURED_M_S2 = 1.5
 """White acceleration where none is measured, per root of Hz: a copter that gains and loses 1 m/s2
 and more for a second."""
+SIGMA_JERK_M_S3 = 10.0
+"""Of an acceleration that is taken to stay: a copter that tilts by 60 degrees in a second."""
 
 
 class BodyState(NamedTuple):
@@ -79,10 +81,23 @@ class BodyState(NamedTuple):
 def propagated(state: BodyState, t_ns: int, integral: AccelerationIntegral) -> BodyState | None:
     """The state at a later time, by what accelerometers measured; None where that is missing."""
     change = integral.between(state.t_ns, t_ns)
-    if change is None:
-        return None
-    density, turn = integral.density_m_s2, state.world_from_attitude
-    found = motion(change, turn, density, TILT_TAU_S, N_STATE)
+    return None if change is None else _changed(state, t_ns, change, integral.density_m_s2)
+
+
+def carried_on(state: BodyState, t_ns: int, integral: AccelerationIntegral) -> BodyState:
+    """The state of the newest sample of accelerometers at a later time, were it to stay so."""
+    dt_s = (t_ns - state.t_ns) * 1e-9
+    after = _changed(state, t_ns, integral.beyond(dt_s), integral.density_m_s2)
+    sigma_m_s2 = float(np.hypot(integral.sigma_m_s2, SIGMA_JERK_M_S3 * dt_s / 2.0))
+    grown = np.zeros((N_STATE, 3))
+    grown[PLACE] = 0.5 * dt_s * dt_s * sigma_m_s2 * np.eye(3)
+    grown[VELOCITY] = dt_s * sigma_m_s2 * np.eye(3)
+    return after._replace(covariance=after.covariance + grown @ grown.T)
+
+
+def _changed(state: BodyState, t_ns: int, change: Change, density_m_s2: float) -> BodyState:
+    """The state after a change that accelerometers of a noise density measured."""
+    found = motion(change, state.world_from_attitude, density_m_s2, TILT_TAU_S, N_STATE)
     mean = found.step @ state.mean
     mean[PLACE] += found.moved_m
     mean[VELOCITY] += found.gained_m_s

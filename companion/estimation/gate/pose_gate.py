@@ -19,6 +19,7 @@ import numpy as np
 
 from companion.config import MEASUREMENTS, FeedbackConfig, Measurement
 from companion.estimation.attitude.attitude_history import MAX_EXTRAPOLATION_NS, AttitudeHistory
+from companion.estimation.gate.held_velocity import HeldVelocity
 from companion.estimation.gate.pose_rules import (
     NO_ATTITUDE,
     UNCERTAIN,
@@ -86,6 +87,7 @@ class PoseGate:
         """Added to our down axis; fixed with the first pose, until a discontinuity."""
         self._resets_seen: int | None = None
         self._accepted: Odometry | None = None
+        self._held = HeldVelocity()
         self._accepted_at_ns = 0
         self._accepted_since_ns: int | None = None
         self._silent_since_ns: int | None = None
@@ -168,6 +170,7 @@ class PoseGate:
             self._last_rejection = why_not
             return None
         self._accepted, self._accepted_at_ns, self._n_predicted = odometry, now_ns, 0
+        self._held.take(odometry)
         self._last_rejection = ""
         if not self.sending:
             if self._accepted_since_ns is None:
@@ -303,12 +306,11 @@ class PoseGate:
         if before is None or now is None:
             self._last_rejection = self._last_rejection or NO_ATTITUDE
             return None
-        pose = self._pose_of(accepted)
-        sigma_m = np.hypot(sigma_place_m(accepted), pose.grown_m(ahead_ns))
-        if not sigma_m <= self._config.max_sigma_m:
+        grown = self._held.after(ahead_ns * 1e-9)
+        if not np.hypot(sigma_place_m(accepted), grown.place_m) <= self._config.max_sigma_m:
             self._last_rejection = self._last_rejection or UNCERTAIN
             return None
-        return pose.ahead(ahead_ns, before, now)
+        return self._pose_of(accepted).ahead(ahead_ns, before, now, grown)
 
     def _stamped(self, pose: PoseToSend) -> PoseToSend | None:
         """The same, if its stamp is later than the last sent."""

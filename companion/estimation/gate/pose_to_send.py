@@ -6,10 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from companion.estimation.gate.held_velocity import Growth
 from companion.geometry.transforms import Array, Pose
-
-SIGMA_ACCELERATION_M_S2 = 3.0
-"""Of a vehicle between two frames, whose velocity a prediction holds: 17 degrees of tilt."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,25 +28,21 @@ class PoseToSend:
     reset_counter: int
     predicted: bool = False
 
-    def ahead(self, ahead_ns: int, attitude: Array, attitude_ahead: Array) -> PoseToSend:
+    def ahead(
+        self, ahead_ns: int, attitude: Array, attitude_ahead: Array, grown: Growth
+    ) -> PoseToSend:
         """The pose so much later, extrapolated by its velocity and turned as the attitude has.
 
-        Attitudes are ned_from_body (3, 3) of the autopilot, at the pose's time and at the later.
+        Attitudes are ned_from_body (3, 3) of the autopilot, at the pose's time and at the later;
+        place and velocity have `grown` less certain.
         """
         ahead_s = ahead_ns * 1e-9
-        changed_m_s = SIGMA_ACCELERATION_M_S2 * ahead_s
         pose = Pose(
             self.world_from_body.rotation @ attitude.T @ attitude_ahead,
             self.world_from_body.translation + self.velocity_world_m_s * ahead_s,
         )
         return replace(
             self, t_ns=self.t_ns + ahead_ns, world_from_body=pose, predicted=True,
-            sigma_position_m=float(np.hypot(self.sigma_position_m, self.grown_m(ahead_ns))),
-            sigma_velocity_m_s=float(np.hypot(self.sigma_velocity_m_s, changed_m_s)),
+            sigma_position_m=float(np.hypot(self.sigma_position_m, grown.place_m)),
+            sigma_velocity_m_s=float(np.hypot(self.sigma_velocity_m_s, grown.velocity_m_s)),
         )  # fmt: skip
-
-    def grown_m(self, ahead_ns: int) -> float:
-        """Standard deviation that a prediction so far ahead adds to the place."""
-        ahead_s = ahead_ns * 1e-9
-        halfway_m_s = 0.5 * SIGMA_ACCELERATION_M_S2 * ahead_s
-        return float(np.hypot(self.sigma_velocity_m_s, halfway_m_s)) * ahead_s

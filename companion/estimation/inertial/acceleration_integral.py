@@ -101,10 +101,14 @@ class AccelerationIntegral:
         return -(2**62) if self._last is None else self._last[0]
 
     @property
+    def sigma_m_s2(self) -> float:
+        """White noise of a sample of the accelerometers, from their own differences."""
+        return max(float(np.sqrt(self._noise_variance)), float(LEAST_NOISE_M_S2))
+
+    @property
     def density_m_s2(self) -> float:
-        """Noise density of the accelerometers, m/s2 per root of Hz, from their own differences."""
-        sigma = max(float(np.sqrt(self._noise_variance)), float(LEAST_NOISE_M_S2))
-        return float(sigma * np.sqrt(self._interval_s))
+        """The same as a density, m/s2 per root of Hz."""
+        return self.sigma_m_s2 * float(np.sqrt(self._interval_s))
 
     def between(self, from_ns: int, to_ns: int) -> Change | None:
         """Integrals between two times; None where measurements are missing."""
@@ -117,6 +121,16 @@ class AccelerationIntegral:
         return Change(
             dt_s, change[0], change[1] - dt_s * start[0],
             change[2:5], change[5:8] - dt_s * start[2:5],
+        )  # fmt: skip
+
+    def beyond(self, dt_s: float) -> Change:
+        """Integrals over a time from the newest sample on, were its acceleration to stay."""
+        assert self._last is not None, "no sample yet"
+        _, acceleration_m_s2, rotation = self._last
+        half_s2 = 0.5 * dt_s * dt_s
+        return Change(
+            dt_s, dt_s * acceleration_m_s2, half_s2 * acceleration_m_s2,
+            -dt_s * rotation, -half_s2 * rotation,
         )  # fmt: skip
 
     def at(self, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:

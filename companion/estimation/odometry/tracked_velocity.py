@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.estimation.body.body_filter import SIGMA_HELD_M_S2, Reckoned
+from companion.estimation.body.body_filter import Reckoned
 from companion.estimation.camera_motion import ImageVelocity
 from companion.geometry.transforms import Array
 
+SIGMA_HELD_M_S2 = 3.0
+"""Acceleration that may have come since, where none is measured."""
 MAX_SIGMA_M_S = 2.0
 """Of a velocity of the filter, which has just begun: that of the last images is better."""
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from companion.config import FeedbackConfig, Measurement
+from companion.estimation.body.body_state import SIGMA_JERK_M_S3
 from companion.estimation.gate.pose_gate import PoseGate, Sending
 from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
@@ -508,8 +509,9 @@ def test_a_velocity_that_is_held_is_less_certain_the_longer_it_is() -> None:
     assert max(since_s) > 0.1
     for pose, held_s in zip(poses, since_s, strict=True):
         assert pose.predicted == (held_s > 0.0)
-        assert pose.sigma_velocity_m_s == pytest.approx(np.hypot(0.2, 3.0 * held_s))
-        grown_m = held_s * np.hypot(0.2, 1.5 * held_s)
+        may_come_m_s = SIGMA_JERK_M_S3 * held_s**2 / 2.0
+        assert pose.sigma_velocity_m_s == pytest.approx(np.hypot(0.2, may_come_m_s))
+        grown_m = held_s * np.hypot(0.2, may_come_m_s / 2.0)
         assert pose.sigma_position_m == pytest.approx(np.hypot(0.1, grown_m))
 
 
