@@ -244,9 +244,20 @@ class Georeferencer:
         sigma_m = SIGMA_VELOCITY_M_S * float(np.sqrt(way_s * max(way_s, VELOCITY_TAU_S)))
         return displacement_m, sigma_m, "velocity"
 
-    def lever_of(self, sample: AlignmentSample) -> Array:
-        """Lever arm (3,) from body to camera, NED metres; zero where the attitude is unknown."""
-        return np.asarray(self._lever_ned([sample])[0])
+    def levers_of(
+        self, samples: list[AlignmentSample], world_from_map: Array | None = None
+    ) -> Array:
+        """Lever arms (N, 3) from body to camera, NED metres, of samples of one map.
+
+        Where an attitude is unknown by a rotation (3, 3) of the map, that of the other attitudes if
+        none is given; zero where nothing tells it.
+        """
+        turn = mean_rotation(samples) if world_from_map is None else world_from_map
+        by_map = np.zeros((3, 3)) if turn is None else turn
+        return self.lever_ned(np.stack([
+            by_map @ p.map_from_camera.rotation if p.ned_from_camera is None else p.ned_from_camera
+            for p in samples
+        ]))  # fmt: skip
 
     def _from_positions(
         self, samples: list[AlignmentSample], level: Level | None, source: PositionSource,
@@ -263,11 +274,16 @@ class Georeferencer:
             return None
         kept = [p for p, good in zip(samples, ok, strict=True) if good]
         mapped = np.stack([p.map_from_camera.translation for p in kept])
-        target = measured[ok] + self._lever_ned(kept)
+        turn = None if level is None else level.world_from_map
+        target = measured[ok] + self.levers_of(kept, turn)
         extent = target - target.mean(0)
         if float(np.linalg.norm(extent, axis=1).max()) < 0.5 * self._config.min_travel_m:
             return None
-        solution = fit_map(t_ns[ok] * 1e-9, mapped, target, travelled_m[ok], level, prior)
+        t_s = t_ns[ok] * 1e-9
+        solution = fit_map(t_s, mapped, target, travelled_m[ok], level, prior)
+        if solution is not None and level is None:  # no attitude but the map's own
+            target = measured[ok] + self.levers_of(kept, solution[0].rotation)
+            solution = fit_map(t_s, mapped, target, travelled_m[ok], level, prior)
         if solution is None:
             return None
         similarity, covariance, residual = solution
@@ -285,12 +301,6 @@ class Georeferencer:
              *([prior.method] if prior is not None else [])]
         )  # fmt: skip
         return Georeference(similarity, sigma_scale, sigma_yaw, method, int(ok.sum()), residual)
-
-    def _lever_ned(self, samples: list[AlignmentSample]) -> Array:
-        """The same for samples; zero where their attitude is unknown."""
-        missing = np.zeros((3, 3))
-        rotations = [missing if p.ned_from_camera is None else p.ned_from_camera for p in samples]
-        return self.lever_ned(np.stack(rotations))
 
     def _from_scale(
         self, samples: list[AlignmentSample], level: Array, found: Scale | None

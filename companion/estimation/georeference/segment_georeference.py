@@ -272,8 +272,8 @@ class SegmentGeoreferences:
             own = own or placed
             if own is None:
                 return None
-            (sample,) = self._samples(segment, [first])
-            start_ned_m = body.place_world_m + self._georeferencer.lever_of(sample)
+            (lever_m,) = self._georeferencer.levers_of(self._samples(segment, [first]))
+            start_ned_m = body.place_world_m + lever_m
             return _beginning_at(own, first, start_ned_m)
         before = [
             (k.t_ns, placed.world_from_map.apply(k.centre))
@@ -312,7 +312,7 @@ class SegmentGeoreferences:
             if start is None or end is None or last is first:
                 return None
             samples = self._samples(segment, [first, last])
-            levers = [self._georeferencer.lever_of(sample) for sample in samples]
+            levers = self._georeferencer.levers_of(samples)
             moved_m = end.place_world_m + levers[1] - start.place_world_m - levers[0]
             sigma_m_s = float(np.sqrt(np.diag(end.start.covariance)[:3].max()))
             sigma_m = sigma_m_s * (last.t_ns - first.t_ns) * 1e-9

@@ -38,9 +38,9 @@ def places(
 
 
 def reference(
-    ned: np.ndarray, noise: np.ndarray, velocity_noise: np.ndarray | None
+    ned: np.ndarray, noise: np.ndarray, velocity_noise: np.ndarray | None, mount: Pose | None = None
 ) -> Georeferencer:
-    georeferencer = Georeferencer(GeoreferenceConfig(), None)
+    georeferencer = Georeferencer(GeoreferenceConfig(), mount)
     t = np.arange(0, len(ned) * 0.5, 0.1)
     for i, s in enumerate(t):
         p = np.array(
@@ -68,6 +68,21 @@ def test_exact_positions_give_the_exact_similarity() -> None:
     np.testing.assert_allclose(
         found.world_from_map.apply(kept[3].map_from_camera.translation), ned[3], atol=0.05
     )
+
+
+@pytest.mark.parametrize("every", [3, 1], ids=["some", "all"])
+def test_the_lever_of_keyframes_without_attitude_is_that_of_the_map(every: int) -> None:
+    """A camera two metres ahead of the body on a vehicle that turns; where it is must come out."""
+    kept, camera_ned = places()
+    mount = Pose(np.eye(3), np.array([2.0, 0.0, 0.0]))
+    levers = np.stack([k.ned_from_camera @ mount.translation for k in kept])
+    without = [replace(k, ned_from_camera=None) for k in kept]
+    kept[::every] = without[::every]
+    body_ned = camera_ned - levers
+    found = reference(body_ned, np.zeros_like(body_ned), None, mount).solve(kept)
+    assert found is not None
+    away = [found.world_from_map.apply(k.map_from_camera.translation) for k in kept] - camera_ned
+    assert np.linalg.norm(away, axis=1).max() < 0.1
 
 
 @pytest.mark.parametrize("seed", range(4))
