@@ -14,11 +14,15 @@ from companion.messages import Georeference
 
 
 class LastPose(NamedTuple):
-    """The last accepted frame: its time, and the pose that was given out for it."""
+    """The last accepted frame: its time, and the pose that was given out for it.
+
+    `sigma_m` is the standard deviation of its place beside what the map drifts by.
+    """
 
     t_ns: int
     map_from_camera: Pose
     odometry_from_body: Pose
+    sigma_m: float
 
     @property
     def place_m(self) -> Array:
@@ -54,12 +58,12 @@ class FlownMap:
         self.frame = OdometryFrame.settled(from_world, anchored, self.frame.slewed_m)
         self.last = None
 
-    def hold(self, t_ns: int, odometry_from_body: Pose) -> None:
+    def hold(self, t_ns: int, odometry_from_body: Pose, sigma_m: float) -> None:
         """Take a pose that the map did not give: the next by the map has to fit it."""
         if self.placed is not None:
             world_from_body = self.frame.from_world.inverse() @ odometry_from_body
             pose = self.placed.map_from_camera(world_from_body)
-            self.last = LastPose(t_ns, pose, odometry_from_body)
+            self.last = LastPose(t_ns, pose, odometry_from_body, sigma_m)
 
     def place_of_camera(self, place_m: Array, map_from_camera: Array) -> Array | None:
         """Place of the camera (3,) in the map, for a place (3,) of the body.

@@ -67,7 +67,7 @@ class OdometryCourse:
         self.velocity, self.dead_reckoning = reckoned.velocity_m_s, True
         georeference, slewed_m = self.flown.georeference, self.flown.frame.slewed_m
         sigma_scale = 0.0 if georeference is None else georeference.sigma_scale
-        self.flown.hold(track.t_ns, placed)
+        self.flown.hold(track.t_ns, placed, reckoned.sigma_place_m)
         drift = self.drift.add(track.t_ns, placed.translation, sigma_scale, slewed_m)
         return Odometry(
             track.seq, track.t_ns, TrackState.DEAD_RECKONING, self.reset_counter, 1, placed,
@@ -91,11 +91,11 @@ class OdometryCourse:
             dt_s = max((track.t_ns - last.t_ns) * 1e-9, 1e-3)
             self.velocity = (placed.translation - last.place_m) / dt_s
         self.dead_reckoning = True
-        self.flown.last = LastPose(track.t_ns, pose, placed)
-        scale = georeference.world_from_map.scale
+        sigma_m = georeference.world_from_map.scale * track.sigma_position
+        self.flown.last = LastPose(track.t_ns, pose, placed, sigma_m)
         return Odometry(
             track.seq, track.t_ns, track.state, self.reset_counter, 1, placed,
-            self.velocity.copy(), max(FLOOR_M, scale * track.sigma_position),
+            self.velocity.copy(), max(FLOOR_M, sigma_m),
             SIGMA_DEAD_RECKONING_M_S, float(np.hypot(FLOOR_RAD, track.sigma_rotation_rad)),
             self.sigma_yaw_rad(georeference, track.sigma_rotation_rad),
         )  # fmt: skip

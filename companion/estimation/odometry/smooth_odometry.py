@@ -187,7 +187,7 @@ class SmoothOdometry:
             to_world.scale * frame.from_world.rotation @ to_world.rotation, noise_m,
         )  # fmt: skip
         course.velocity, sigma_velocity = found or (course.velocity, float("inf"))
-        flown.last = LastPose(track.t_ns, pose, placed)
+        flown.last = LastPose(track.t_ns, pose, placed, noise_m)
         drift = course.drift.add(
             track.t_ns, placed.translation, georeference.sigma_scale, frame.slewed_m,
             noise_m,

@@ -47,7 +47,7 @@ class Stand:
         if reckoned is not None:
             sigma_m = reckoned.sigma_place_m
         elif last is not None and t_ns - last.t_ns <= FRESH_NS:
-            sigma_m = 0.0
+            sigma_m = last.sigma_m
         known = sigma_m <= MAX_SIGMA_M
         self._sigma_m = sigma_m if course.given and known else 0.0
         if course.given and not known:  # the first place needs no certainty
@@ -85,10 +85,15 @@ class Stand:
             return Odometry(track.seq, track.t_ns, TrackState.STANDING, course.reset_counter)
         placed = Pose(fixed.world_from_attitude @ attitude.ned_from_body, fixed.place_m)
         course.velocity, course.dead_reckoning = np.zeros(3), True
-        course.flown.hold(track.t_ns, placed)
+        course.flown.hold(track.t_ns, placed, self._sigma_m)
+        georeference = course.flown.georeference
+        sigma_scale = 0.0 if georeference is None else georeference.sigma_scale
+        slewed_m = course.flown.frame.slewed_m
+        drift = course.drift.add(track.t_ns, fixed.place_m, sigma_scale, slewed_m)
         return Odometry(
             track.seq, track.t_ns, TrackState.STANDING, course.reset_counter, 100, placed,
-            np.zeros(3), float(np.hypot(FLOOR_M, self._sigma_m)), SIGMA_STANDING_M_S,
-            SIGMA_ATTITUDE_RAD,
-            course.sigma_yaw_rad(course.flown.georeference, SIGMA_ATTITUDE_RAD),
+            np.zeros(3), float(np.linalg.norm([FLOOR_M, self._sigma_m, *drift])),
+            SIGMA_STANDING_M_S, SIGMA_ATTITUDE_RAD,
+            course.sigma_yaw_rad(georeference, SIGMA_ATTITUDE_RAD),
+            sigma_by_scale_m=drift.by_scale_m,
         )  # fmt: skip

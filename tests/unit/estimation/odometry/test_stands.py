@@ -165,6 +165,20 @@ def test_what_it_does_not_know_of_where_it_landed_is_stated() -> None:
 
 
 @pytest.mark.parametrize("has_imu", [True, False])
+def test_a_landing_is_as_certain_as_the_way_to_it_and_then_forgets_that(has_imu: bool) -> None:
+    vehicle = Vehicle(has_imu)
+    for k in range(60):
+        landed = vehicle.frame(HERE + [0.2 * k, 0.0, 0.0])
+    scale_m = 11.8 * PLACED.sigma_scale
+    stood = vehicle.frame(HERE + [11.8, 0.0, 0.0], standing=True)
+    assert stood.reset_counter == 0
+    assert 0.5 * scale_m < stood.sigma_by_scale_m < scale_m
+    assert abs(stood.sigma_position_m - landed.sigma_position_m) < 0.03
+    later = vehicle.frames(120, standing=True)
+    assert later.sigma_by_scale_m == 0.0 and 0.02 < later.sigma_position_m < 0.06
+
+
+@pytest.mark.parametrize("has_imu", [True, False])
 def test_a_few_points_at_the_edge_of_a_map_give_way_to_accelerometers(has_imu: bool) -> None:
     vehicle = Vehicle(has_imu)
     vehicle.frames(20, HERE)
