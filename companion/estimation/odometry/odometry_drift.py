@@ -2,8 +2,9 @@
 
 Each point of the map is as wrong as the poses that it was triangulated from. A pose by points that
 were known before drifts no further; where all that is in view is new, it is off by what a pose was
-off by when they were made. So drift is a random walk that takes a step, of the noise of a pose,
-each time that the view has been renewed.
+off by when they were made. So drift is a random walk that takes a step, of the noise of an image,
+each time that the view has been renewed. What else a pose is off by is the error of its points:
+that is the walk itself, and no step of it.
 """
 
 from __future__ import annotations
@@ -74,8 +75,8 @@ class OdometryDrift:
     ) -> Drift:
         """Add a position (3,), metres, with all corrections (3,) so far; the drift up to it.
 
-        `noise_m` is that of its image, 0 where it comes of none. Standard deviations are along each
-        axis.
+        `noise_m` is that of its image alone, 0 where it comes of none. Standard deviations are
+        along each axis.
         """
         path_length_m, walked_m2 = 0.0, 0.0
         if self._path:

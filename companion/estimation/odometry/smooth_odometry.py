@@ -33,7 +33,7 @@ vehicle that turns on the spot sees new ground without parallax."""
 SIGMA_DOUBTED_M, SIGMA_DOUBTED_M_S = 0.1, 0.1
 """At least, of inertial navigation that a wrong map has aided."""
 NOISE_INFLATION = 3.0
-"""Inflation for correlated errors of the matches of one image."""
+"""Inflation for correlated errors of the matches of one image: those of the points they share."""
 
 
 class SmoothOdometry:
@@ -176,7 +176,8 @@ class SmoothOdometry:
         course.body.move(
             placed.rotation @ here.rotation.T, here.translation, placed.translation, 1.0
         )
-        noise_m = NOISE_INFLATION * track.sigma_position * georeference.world_from_map.scale
+        image_m = track.sigma_position * georeference.world_from_map.scale
+        noise_m = NOISE_INFLATION * image_m
         if attitude is not None and georeference.sigma_scale < MAX_SIGMA_SCALE_AIDING:
             turned = placed.rotation @ attitude.ned_from_body.T
             course.body.aid(AidedPlace(attitude.t_ns, placed.translation, turned, noise_m))
@@ -189,9 +190,8 @@ class SmoothOdometry:
         course.velocity, sigma_velocity = found or (course.velocity, float("inf"))
         flown.last = LastPose(track.t_ns, pose, placed, noise_m)
         drift = course.drift.add(
-            track.t_ns, placed.translation, georeference.sigma_scale, frame.slewed_m,
-            noise_m,
-        )  # fmt: skip
+            track.t_ns, placed.translation, georeference.sigma_scale, frame.slewed_m, image_m
+        )  # without the errors of points: what the drift hands on
         noise_rad = NOISE_INFLATION * track.sigma_rotation_rad
         return Odometry(
             track.seq, track.t_ns, track.state, course.reset_counter,
