@@ -75,7 +75,7 @@ def test_the_lever_of_keyframes_without_attitude_is_that_of_the_map(every: int) 
     """A camera two metres ahead of the body on a vehicle that turns; where it is must come out."""
     kept, camera_ned = places()
     mount = Pose(np.eye(3), np.array([2.0, 0.0, 0.0]))
-    levers = np.stack([k.ned_from_camera @ mount.translation for k in kept])
+    levers = np.stack([TRUTH.rotation @ k.map_from_camera.rotation @ [2.0, 0, 0] for k in kept])
     without = [replace(k, ned_from_camera=None) for k in kept]
     kept[::every] = without[::every]
     body_ned = camera_ned - levers
