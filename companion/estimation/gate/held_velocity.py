@@ -43,7 +43,7 @@ class HeldVelocity:
         self._sigma_m_s2 = float(changed_m_s) / (dt_s * float(np.sqrt(3.0)))
 
     def after(self, ahead_s: float) -> Growth:
-        """What comes to a prediction by the velocity of the last frame."""
+        """Growth of a prediction by the velocity of the last frame."""
         assert self._last is not None
         sigma_m_s2 = float(np.hypot(self._sigma_m_s2, SIGMA_JERK_M_S3 * ahead_s / 2.0))
         changed_m_s = sigma_m_s2 * ahead_s
