@@ -110,6 +110,8 @@ class FeedbackConfig:
     for ArduPilot, OPTICAL_FLOW_RAD for PX4."""
     obstacle_distance: bool = False
     """Send OBSTACLE_DISTANCE: what stands around the vehicle by the newest images and depths."""
+    obstacles_3d: bool = False
+    """Send it to ArduPilot as OBSTACLE_DISTANCE_3D instead: with heights, above and below too."""
 
     @property
     def sends_position(self) -> bool:

@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
+
 from companion.config import Config, FeedbackConfig
 from companion.daemon.flights.flights import Flights
 from companion.daemon.health_watch import HealthWatch
@@ -23,11 +25,12 @@ from drivers.mavlink.camera_component import CameraComponent
 from drivers.mavlink.camera_messages import CameraStream
 from drivers.mavlink.computer_status import computer_status
 from drivers.mavlink.ground.command_server import Command
-from drivers.mavlink.measurements.obstacle_distance import obstacle_distance
+from drivers.mavlink.measurements.obstacle_distance import obstacle_distance, obstacles_3d
 from drivers.mavlink.message_requests import (
     COMPUTER_STATUS,
     HEARTBEAT,
     OBSTACLES,
+    OBSTACLES_3D,
     ODOMETRY,
     VISION_POSITION,
     MessageRequests,
@@ -46,7 +49,7 @@ first they are sent, too: ArduPilot cannot be armed while its proximity sensor s
 
 
 class VehicleReports:
-    """Sends ONBOARD_COMPUTER_STATUS, by default each second, and OBSTACLE_DISTANCE."""
+    """Sends ONBOARD_COMPUTER_STATUS, by default each second, and obstacles."""
 
     def __init__(
         self, link: AutopilotLink, clock: FlightClock, watch: HealthWatch, config: Config,
@@ -104,8 +107,7 @@ class VehicleReports:
                 credit = 0.0
                 self._link.send(self.computer_status())
             if self._obstacles:
-                message = await loop.run_in_executor(None, self._obstacle_distance)
-                if message is not None:
+                for message in await loop.run_in_executor(None, self._obstacle_messages):
                     self._link.send(message)
 
     def computer_status(self) -> object:
@@ -126,7 +128,8 @@ class VehicleReports:
             return {
                 HEARTBEAT: 1.0,
                 COMPUTER_STATUS: self.computer_hz,
-                OBSTACLES: OBSTACLES_HZ if self._obstacles else 0.0,
+                OBSTACLES: OBSTACLES_HZ if self._obstacles and not self._in_space else 0.0,
+                OBSTACLES_3D: OBSTACLES_HZ if self._obstacles and self._in_space else 0.0,
                 ODOMETRY: sent.rate_hz if sent.mode == "odometry" else 0.0,
                 VISION_POSITION: sent.rate_hz if sent.mode == "vision_position" else 0.0,
             }
@@ -155,19 +158,33 @@ class VehicleReports:
             is_running=camera is not None,
         )  # fmt: skip
 
-    def _obstacle_distance(self) -> object | None:
-        """OBSTACLE_DISTANCE now; None where nothing was known for long."""
-        now_ns, vehicle, finder = self._clock.now_ns(), self._link.vehicle, self._finder
-        is_px4 = vehicle is not None and vehicle.firmware == "px4"
-        found = (
-            finder.obstacles(now_ns, FREE_M if is_px4 else MAX_M) if finder is not None else None
-        )
-        if found is not None:
+    def _obstacle_messages(self) -> list[object]:
+        """Obstacles now; none where nothing was known for long."""
+        now_ns, finder = self._clock.now_ns(), self._finder
+        if self._in_space:
+            points = None if finder is None else finder.in_space(now_ns)
+            told = obstacles_3d(np.zeros((0, 3)) if points is None else points, now_ns)
+            is_known = points is not None
+        else:
+            reach_m = FREE_M if self._firmware == "px4" else MAX_M
+            found = None if finder is None else finder.obstacles(now_ns, reach_m)
+            told = [obstacle_distance(unknown(now_ns) if found is None else found)]
+            is_known = found is not None
+        if is_known:
             self._known_ns = now_ns
         elif self._known_ns is not None and now_ns - self._known_ns > UNKNOWN_AFTER_NS:
-            return None
-        told: object = obstacle_distance(unknown(now_ns) if found is None else found)
+            return []
         return told
+
+    @property
+    def _firmware(self) -> str:
+        vehicle = self._link.vehicle
+        return "" if vehicle is None else vehicle.firmware
+
+    @property
+    def _in_space(self) -> bool:
+        """True if obstacles go to the autopilot with their heights, which ArduPilot alone takes."""
+        return self._config.feedback.obstacles_3d and self._firmware == "ardupilot"
 
 
 def flight_recording(config: Config, flights: Flights) -> FlightRecording:

@@ -58,9 +58,15 @@ def sectors_seen(
     keypoints_px: Floats, world_from_camera: Pose, world_from_body: Pose, camera: Camera
 ) -> NDArray[np.bool_]:
     """Mask (72,) of sectors around a vehicle in which a frame has found enough map points."""
-    flat = camera.normalise(keypoints_px)
-    rays = np.c_[flat, np.ones(len(flat))] @ world_from_camera.rotation.T
-    rays = rays[np.isfinite(rays).all(1)]
+    rays = rays_of(keypoints_px, world_from_camera, camera)
     level = np.abs(rays[:, 2]) <= np.tan(MAX_ELEVATION_RAD) * np.hypot(rays[:, 0], rays[:, 1])
     counts = np.bincount(sector_of(rays[level], world_from_body), minlength=N_SECTORS)
     return np.asarray(counts >= MIN_POINTS)
+
+
+def rays_of(keypoints_px: Floats, world_from_camera: Pose, camera: Camera) -> Array:
+    """Rays (N, 3) of keypoints, in world axes, as far as the lens model gives any."""
+    flat = camera.normalise(keypoints_px)
+    rays = np.c_[flat, np.ones(len(flat))] @ world_from_camera.rotation.T
+    out: Array = rays[np.isfinite(rays).all(1)]
+    return out

@@ -6,12 +6,15 @@ Depth of a keyframe comes a second or two late. What is told is confirmed by the
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from companion.dense.clear_sight import free_sectors
-from companion.dense.fresh_sight import points_found, sectors_seen
+from companion.dense.fresh_sight import points_found, rays_of, sectors_seen
 from companion.dense.newest_sight import NewestSight, Seen, things_in
+from companion.dense.obstacle_space import cells_with, nearest_in_cells
 from companion.dense.obstacles import (
     FREE_M,
     MIN_POINTS,
@@ -24,7 +27,17 @@ from companion.dense.obstacles import (
 )
 from companion.dense.sight_tracks import WINDOW_PX
 from companion.geometry.camera import Camera
-from companion.messages import Bytes, DepthMap, Frame, MapUpdate, PointChunk, Track, TrackState
+from companion.geometry.transforms import Array, Pose
+from companion.messages import (
+    Bytes,
+    DepthMap,
+    Floats,
+    Frame,
+    MapUpdate,
+    PointChunk,
+    Track,
+    TrackState,
+)
 
 MAX_AGE_NS = 200_000_000
 """Age of the image that the pose is from, and of that in which a sector was seen, since exposure;
@@ -33,6 +46,22 @@ MOST_TRACKS = 16
 """Frames within that age, and more at 60 a second: every other is then enough."""
 MOST_WAITING = 4
 """Depth maps and chunks between two rounds; of more the newest count. One takes a megabyte."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """Points around the vehicle, and what confirms them.
+
+    That are keypoints of the newest frames, with `world_from_camera` of each, and things (M, 3) in
+    the newest image.
+    """
+
+    t_ns: int
+    world_from_body: Pose
+    points_world_m: Array
+    sights: Sequence[tuple[Floats, Pose]]
+    newest: Seen | None
+    things_world_m: Array
 
 
 class ObstacleFinder:
@@ -75,6 +104,46 @@ class ObstacleFinder:
 
         Known are sectors alone in which one of the newest frames has found points of the map.
         """
+        known = self._known(now_ns)
+        if known is None:
+            return None
+        is_seen = np.zeros(N_SECTORS, bool)
+        for keypoints_px, world_from_camera in known.sights:
+            is_seen |= sectors_seen(
+                keypoints_px, world_from_camera, known.world_from_body, self._camera
+            )
+        is_free = np.zeros(N_SECTORS, bool)
+        if known.newest is not None:
+            things = known.things_world_m - known.world_from_body.translation
+            around = sector_of(things, known.world_from_body)
+            is_seen |= np.bincount(around, minlength=N_SECTORS) >= MIN_POINTS
+            if reach_m <= FREE_M:
+                window_rad = WINDOW_PX / self._camera.fx
+                is_free = free_sectors(known.newest, known.world_from_body, window_rad)
+        return known_in(
+            obstacles_around(
+                known.t_ns, known.world_from_body, known.points_world_m, is_free, reach_m
+            ),
+            is_seen | is_free,
+        )
+
+    def in_space(self, now_ns: int) -> Array | None:
+        """The nearest obstacle (N, 3) in each part of the space around, metres, in body axes.
+
+        None while the pose is unknown or old. See `companion.dense.obstacle_space`.
+        """
+        known = self._known(now_ns)
+        if known is None:
+            return None
+        pose = known.world_from_body
+        is_seen = cells_with(known.things_world_m - pose.translation, pose)
+        for keypoints_px, world_from_camera in known.sights:
+            rays = rays_of(keypoints_px, world_from_camera, self._camera)
+            is_seen |= cells_with(rays, pose)
+        return nearest_in_cells(pose, known.points_world_m, is_seen)
+
+    def _known(self, now_ns: int) -> _Known | None:
+        """All that is known now, by the map's own pose; None while that is unknown or old."""
         track, tracks, update = self._track, list(self._tracks), self._map
         while self._waiting:
             message = self._waiting.popleft()
@@ -95,31 +164,22 @@ class ObstacleFinder:
         world_from_body = (
             world_from_map.apply_to_pose(track.map_from_camera) @ self._camera.camera_from_body
         )
-        is_seen = np.zeros(N_SECTORS, bool)
+        sights: list[tuple[Floats, Pose]] = []
         for each in tracks:
             pose = each.map_from_camera
             if pose is None or each.keypoints_px is None or now_ns - each.t_ns > MAX_AGE_NS:
                 continue
-            is_seen |= sectors_seen(
-                each.keypoints_px, world_from_map.apply_to_pose(pose), world_from_body, self._camera
-            )
+            sights.append((each.keypoints_px, world_from_map.apply_to_pose(pose)))
             if each is track:
                 found = points_found(update.points_map, each.keypoints_px, pose, self._camera)
                 points = np.concatenate([points, world_from_map.apply(found)])
-        is_free = np.zeros(N_SECTORS, bool)
-        newest = self._newest_sight(track, update)
-        if newest is not None and now_ns - newest.t_ns <= MAX_AGE_NS:
-            window_rad = WINDOW_PX / self._camera.fx
-            things = things_in(newest, 0.5 * window_rad)
+        newest, things = self._newest_sight(track, update), np.zeros((0, 3))
+        if newest is None or now_ns - newest.t_ns > MAX_AGE_NS:
+            newest = None
+        else:
+            things = things_in(newest, 0.5 * WINDOW_PX / self._camera.fx)
             points = np.concatenate([points, things])
-            around = sector_of(things - world_from_body.translation, world_from_body)
-            is_seen |= np.bincount(around, minlength=N_SECTORS) >= MIN_POINTS
-            if reach_m <= FREE_M:
-                is_free = free_sectors(newest, world_from_body, window_rad)
-        return known_in(
-            obstacles_around(track.t_ns, world_from_body, points, is_free, reach_m),
-            is_seen | is_free,
-        )
+        return _Known(track.t_ns, world_from_body, points, sights, newest, things)
 
     def _newest_sight(self, track: Track, update: MapUpdate) -> Seen | None:
         """Points of the newest image whose track has come."""

@@ -146,9 +146,10 @@ class Approach:
         firmwares: tuple[Firmware, ...] = ("ardupilot", "px4")
         for firmware in firmwares:
             self._link.vehicle = Vehicle(1, firmware, True, "")
-            told[firmware] = self._reports._obstacle_distance()
-        if told["px4"] is None:
-            return
+            messages = self._reports._obstacle_messages()
+            if not messages:
+                return
+            (told[firmware],) = messages
         body = self._place((frame.t_ns - START_NS) * 1e-9)
         yaw = np.arctan2(body.rotation[1, 0], body.rotation[0, 0])
         within = np.radians(SECTOR_DEG * np.linspace(-0.5, 0.5, 25))

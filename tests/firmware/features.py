@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,6 +25,11 @@ WALL_NORTH_M, CLEAR_M = 16.0, 1.5
 FORWARD = 0.25
 """Of the pitch stick: 3 m/s by ArduCopter's LOIT_SPEED of 12.5 m/s."""
 WALL_S, STOPPED_M_S = 25.0, 0.1
+BEFORE_A_WALL = Conditions(
+    wind_m_s=0.0, pitch_deg=-20.0, landmarks=f"wall:{WALL_NORTH_M:g}", has_depth=True,
+    parameters={"PRX1_TYPE": 2, "PRX_FILT": 0, "AVOID_ENABLE": 7},
+    settings=("feedback.obstacle_distance=true", "depth.stride=4"),
+)  # fmt: skip
 OWN_SOURCES = {
     "VISO_TYPE": 1, "VISO_DELAY_MS": 62, "EK3_SRC1_POSXY": 3, "EK3_SRC1_VELXY": 3,
     "EK3_SRC1_VELZ": 3, "EK3_SRC2_POSXY": 6, "EK3_SRC2_VELXY": 6, "EK3_SRC2_VELZ": 6,
@@ -136,10 +141,8 @@ def wall(trial: Trial, figures: Figures) -> None:
     path = trial.ground.window(began_s, time.time())
     clear_m = WALL_NORTH_M - float(path[:, 0].max())
     nearest = trial.ground.latest.get("COMPANION/OBSTACLE_DISTANCE")
-    seen_m = min(nearest.distances) / 100 if nearest else math.nan
-    trial.mark(
-        f"stopped {clear_m:.2f} m before the wall, which it is told to be {seen_m:.2f} m off"
-    )
+    told = f", which it is told to be {min(nearest.distances) / 100:.2f} m off" if nearest else ""
+    trial.mark(f"stopped {clear_m:.2f} m before the wall{told}")
     figures.add("flown towards the wall", float(path[-1, 0] - path[0, 0]), "m")
     figures.add("nearer to the wall than 1.5 m by", max(0.0, CLEAR_M - clear_m), "m", 0.0,
                 f"{clear_m:.2f} m clear")  # fmt: skip
@@ -195,9 +198,8 @@ FEATURES: dict[str, tuple[Callable[[Trial, Figures], None], Conditions]] = {
                     "EKF2_AGP0_DELAY": 60},
         settings=("feedback.global_position=sensor",),
     )),
-    "wall": (wall, Conditions(
-        wind_m_s=0.0, pitch_deg=-20.0, landmarks=f"wall:{WALL_NORTH_M:g}", has_depth=True,
-        parameters={"PRX1_TYPE": 2, "PRX_FILT": 0, "AVOID_ENABLE": 7},
-        settings=("feedback.obstacle_distance=true", "depth.stride=4"),
+    "wall": (wall, BEFORE_A_WALL),
+    "wall_3d": (wall, replace(
+        BEFORE_A_WALL, settings=(*BEFORE_A_WALL.settings, "feedback.obstacles_3d=true")
     )),
 }  # fmt: skip

@@ -11,7 +11,7 @@ FIXED_SECTIONS = frozenset({
 FIXED_KEYS = frozenset({
     "expert.daemon.socket", "expert.daemon.prometheus_port", "feedback.mode",
     "feedback.global_position",
-    "feedback.obstacle_distance", "telemetry.use",
+    "feedback.obstacle_distance", "feedback.obstacles_3d", "telemetry.use",
 })  # fmt: skip
 """Keys read at the start only. All others take effect at once or with the next flight."""
 

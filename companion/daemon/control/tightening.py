@@ -60,6 +60,7 @@ WHILE_ARMED: Mapping[str, MayChange] = {
     "feedback.flow": _to_off,
     # obstacle avoidance of the autopilot relies on these messages
     "feedback.obstacle_distance": _not_at_all,
+    "feedback.obstacles_3d": _not_at_all,
     # a map begun in the air accepts its scale, and its frames, by these
     "expert.georeference.min_travel_m": _to_more,
     "expert.georeference.max_sigma_scale": _to_less,

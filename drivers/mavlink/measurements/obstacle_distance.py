@@ -1,12 +1,17 @@
-"""Obstacles as OBSTACLE_DISTANCE, in the frame of the vehicle's heading."""
+"""Obstacles as OBSTACLE_DISTANCE, by the vehicle's heading, and as OBSTACLE_DISTANCE_3D."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.dense.obstacles import SECTOR_DEG, Obstacles
+from companion.dense.obstacles import MAX_M, MIN_M, SECTOR_DEG, Obstacles
+from companion.geometry.transforms import Array
+
+NO_ID = 65535
+"""Obstacles are not followed from one round to the next."""
 
 
 def obstacle_distance(obstacles: Obstacles) -> Any:
@@ -22,3 +27,25 @@ def obstacle_distance(obstacles: Obstacles) -> Any:
         angle_offset=0.0,
         frame=mavlink.MAV_FRAME_BODY_FRD,
     )
+
+
+def obstacles_3d(points_body_m: Array, t_ns: int) -> list[Any]:
+    """One message for each obstacle (N, 3), and a last one, which holds none.
+
+    ArduPilot takes messages of one time for one round, and counts them once another time comes:
+    so the last one, whose distance of 0 it takes for no obstacle, is a millisecond later. It also
+    tells that nothing is there.
+    """
+    t_ms = t_ns // 1_000_000 & 0xFFFFFFFF
+    return [
+        mavlink.MAVLink_obstacle_distance_3d_message(
+            time_boot_ms=(t_ms + late_ms) & 0xFFFFFFFF,
+            sensor_type=mavlink.MAV_DISTANCE_SENSOR_UNKNOWN,
+            frame=mavlink.MAV_FRAME_BODY_FRD,
+            obstacle_id=NO_ID,
+            x=float(x), y=float(y), z=float(z),
+            min_distance=MIN_M, max_distance=MAX_M,
+        )
+        for late_ms, points in ((0, points_body_m), (1, np.zeros((1, 3))))
+        for x, y, z in points
+    ]  # fmt: skip

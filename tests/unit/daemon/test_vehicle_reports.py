@@ -119,8 +119,8 @@ class Approach:
         self.late.append((t_ns + round(0.6 * S), made))
 
     def now(self) -> list[int]:
-        message: Any = self.reports._obstacle_distance()
-        return [] if message is None else list(message.distances)
+        messages: Any = self.reports._obstacle_messages()
+        return list(messages[0].distances) if messages else []
 
 
 def truth_cm(approach: Approach, sector: int) -> float:
@@ -193,19 +193,21 @@ def test_points_of_the_map_in_the_newest_frame_are_obstacles() -> None:
     assert min(found[0], found[71]) == pytest.approx(100 * (8.0 - approach.position[0]), abs=30)
 
 
-def looked(firmware: Firmware, n_images: int = 12) -> tuple[list[int], VehicleReports]:
-    """Distances by images and poses alone, past a pole of 0.3 m, 6 m ahead, before a far wall."""
+def looked(
+    firmware: Firmware, n_images: int = 12, in_space: bool = False
+) -> tuple[list[Any], VehicleReports]:
+    """Told by images and poses alone, past a pole of 0.3 m, 6 m ahead, before a far wall."""
     clock: Any = SetClock()
     link = memory_link(MemoryPort(), clock, lambda _: None)
     link.vehicle = Vehicle(1, firmware, True, "")
     watch: Any = None
-    config = Config(feedback=FeedbackConfig(obstacle_distance=True))
+    config = Config(feedback=FeedbackConfig(obstacle_distance=True, obstacles_3d=in_space))
     reports = VehicleReports(link, clock, watch, config)
     reports.restart(EYE)
     keyframe = Pose(np.eye(3), np.array([0.0, 0.0, -3.0])) @ FORWARD
     world = Georeference(Similarity.identity(), 0.01, 0.01, "", 9, 0.1)
     reports.take(MapUpdate(1, clock.t_ns, {7: keyframe}, np.zeros((0, 3)), world))
-    message: Any = None
+    messages: list[Any] = []
     for n in range(n_images):
         pose = Pose(np.eye(3), np.array([0.0, 0.08 * n - 0.88, -3.0])) @ FORWARD
         grey = SCENE.picture(EYE, pose)
@@ -213,23 +215,43 @@ def looked(firmware: Firmware, n_images: int = 12) -> tuple[list[int], VehicleRe
         relative = keyframe.inverse() @ pose
         reports.take(Track(n, clock.t_ns, TrackState.TRACKING, pose, 7, relative))
         clock.t_ns += S // 10
-        message = reports._obstacle_distance()
-    return list(message.distances), reports
+        messages = reports._obstacle_messages()
+    return messages, reports
 
 
 def test_images_alone_tell_of_a_pole_and_of_free_space() -> None:
     """To PX4 what is free is told, up to where it is; to ArduPilot, which does not ask, what stands
     farther away."""
-    told, reports = looked("px4")
+    (message,), _ = looked("px4")
+    told = list(message.distances)
     assert min(told[1], told[2]) == pytest.approx(100 * np.hypot(6.0, 0.8), abs=60)
     assert told[70] == told[71] == round(100 * FREE_M) + 1
     assert set(told[5:68]) == {UNKNOWN}
-    told, _ = looked("ardupilot")
+    (message,), reports = looked("ardupilot")
+    told = list(message.distances)
     assert min(told[1], told[2]) == pytest.approx(100 * np.hypot(6.0, 0.8), abs=60)
     assert told[70] == told[71] == UNKNOWN
     reports._clock.t_ns += MAX_AGE_NS  # type: ignore[attr-defined]
-    message: Any = reports._obstacle_distance()
-    assert set(message.distances) == {UNKNOWN}
+    (message,) = reports._obstacle_messages()
+    assert set(message.distances) == {UNKNOWN}  # type: ignore[attr-defined]
+
+
+def test_in_space_ardupilot_is_told_where_the_pole_stands() -> None:
+    """In body axes; PX4, which does not take such messages, is told distances."""
+    told, reports = looked("ardupilot", in_space=True)
+    *things, last = told
+    assert things
+    for each in things:
+        assert each.get_type() == "OBSTACLE_DISTANCE_3D"
+        assert np.hypot(each.x, each.y) == pytest.approx(np.hypot(6.0, 0.8), abs=0.6)
+        assert np.arctan2(each.y, each.x) == pytest.approx(np.arctan2(0.8, 6.0), abs=0.06)
+    # what tells that the round is over, and holds nothing
+    assert (last.x, last.y, last.z) == (0.0, 0.0, 0.0)
+    assert {each.time_boot_ms for each in things} == {last.time_boot_ms - 1}
+    reports._clock.t_ns += MAX_AGE_NS  # type: ignore[attr-defined]
+    assert len(reports._obstacle_messages()) == 1
+    (message,), _ = looked("px4", in_space=True)
+    assert message.get_type() == "OBSTACLE_DISTANCE"
 
 
 def test_an_old_image_makes_everything_unknown_and_then_silent() -> None:
