@@ -45,6 +45,7 @@ FIXED: dict[str, Any] = {
     "feedback.set_origin": False, "feedback.origin_latitude_deg": 47.0,
     "feedback.origin_longitude_deg": 8.0, "feedback.origin_altitude_m": 400.0,
     "feedback.obstacle_distance": True,
+    "feedback.obstacles_3d": True,
 }  # fmt: skip
 
 
