@@ -29,6 +29,7 @@ SINCE = {
     "camera.exposure", "computer.profile", "distributed.ros_domain",
     "camera.readout_ms", "expert.export.mesh_m", "expert.link.gimbal_hz", "mount.gimbal_delay_ms",
     "mount.gimbal_sigma_deg", "mount.type", "feedback.flow", "feedback.global_position",
+    "feedback.obstacles_3d",
     "gps.satellites_set", "gps.switch_source", "gps.vision_set",
     "landing.id", "landing.marker", "landing.size_m", "map.use",
     "page.listen", "telemetry.use", "video.kbit_s", "video.overlay", "video.listen",
