@@ -15,6 +15,7 @@ from companion.products.export.mesh import Mesh
 from companion.products.export.textured_mesh import Patch, TexturedMesh
 
 VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+COLOURS, UNLIT = "_COLOR", "KHR_materials_unlit"
 FACE = np.dtype([("n", "u1"), ("corners", "<i4", 3)])
 
 
@@ -45,8 +46,12 @@ def textured_gltf(textured: TexturedMesh) -> bytes:
 
 
 def _coloured(mesh: Mesh) -> Any:
-    made = _trimesh()
-    return made.Trimesh(_axes(mesh.vertices), mesh.faces, vertex_colors=mesh.rgb, process=False)
+    out = _trimesh().Trimesh(_axes(mesh.vertices), mesh.faces, process=False)
+    # trimesh writes colours as bytes, of which linear ones, as glTF's are, have few dark ones
+    srgb = np.c_[mesh.rgb, np.full(len(mesh.rgb), 255)] / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    out.vertex_attributes[COLOURS] = np.rint(65535 * linear).astype(np.uint16)
+    return out
 
 
 def _pictured(patch: Patch) -> Any:
@@ -72,8 +77,25 @@ def _axes(vertices_ned: Array) -> Array:
 
 
 def _glb(parts: list[Any]) -> bytes:
-    data: Any = _trimesh().Scene(parts).export(file_type="glb", include_normals=True)
+    scene = _trimesh().Scene(parts)
+    data: Any = scene.export(file_type="glb", include_normals=True, tree_postprocessor=_unlit)
     return bytes(data)
+
+
+def _unlit(tree: Any) -> None:
+    """Have colours shown as they are: they have the light of the day in them."""
+    materials = tree.setdefault("materials", [])
+    for primitive in (each for mesh in tree["meshes"] for each in mesh["primitives"]):
+        if "material" not in primitive:
+            primitive["material"] = len(materials)
+            materials.append({"pbrMetallicRoughness": {"metallicFactor": 0.0}})
+        places = primitive["attributes"]
+        if COLOURS in places:
+            places["COLOR_0"] = places.pop(COLOURS)
+            tree["accessors"][places["COLOR_0"]]["normalized"] = True
+    for material in materials:
+        material["extensions"] = {UNLIT: {}}
+    tree["extensionsUsed"] = [UNLIT]
 
 
 def _trimesh() -> Any:

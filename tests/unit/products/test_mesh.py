@@ -88,7 +88,10 @@ def test_files_read_back(mesh: Mesh) -> None:
     (gltf,) = scene.geometry.values()
     north, east, down = mesh.vertices.T
     np.testing.assert_allclose(gltf.vertices, np.stack([east, -down, -north], 1), atol=1e-4)
-    assert (gltf.visual.vertex_colors[:, :3] == mesh.rgb).all()
+    linear = gltf.visual.vertex_attributes["color"][:, :3] / 65535
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    assert (np.rint(255 * srgb) == mesh.rgb).all()
+    assert b'"extensionsUsed":["KHR_materials_unlit"]' in data
     up = gltf.face_normals[np.argmax(gltf.triangles_center[:, 1])]
     assert up[1] > 0.8
 
