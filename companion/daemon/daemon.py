@@ -22,7 +22,7 @@ from companion.daemon.flight_starts import NOT_BEGUN, FlightStarts
 from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.flight_facts import facts_of
 from companion.daemon.flights.flights import Flights
-from companion.daemon.flights.live_flight import Listener, LiveFlight
+from companion.daemon.flights.live_flight import Given, Listener, LiveFlight
 from companion.daemon.flights.recording_recovery import RecordingRecovery
 from companion.daemon.health_watch import HealthWatch
 from companion.daemon.link_watch import LinkWatch
@@ -262,7 +262,7 @@ class Daemon:
         self._flights.take(sample)
         self._feed.exposure.take_telemetry(sample)
         if self._senders is not None:
-            self._senders.take_sample(sample)
+            self._senders.take(sample)
         if isinstance(sample, ArmedSample):
             self._starts.set_armed(sample.armed)
 
@@ -276,46 +276,38 @@ class Daemon:
 
             return lambda message: self._soon(later, message)
 
-        senders = self._senders
-        take_doubt = current(senders.take_doubt if senders is not None else _nothing)
+        to_senders = current(self._senders.take if self._senders is not None else _nothing)
 
         def warned(warning: Warned) -> None:
             self._on_warned(warning)
-            take_doubt(warning)
+            to_senders(warning)
 
         reports = self._reports if self._settings.config.feedback.obstacle_distance else None
         return Listener(
-            odometry=current(self._on_odometry),
-            flow=current(senders.take_flow if senders is not None else _nothing),
-            landing=current(senders.take_landing if senders is not None else _nothing),
-            georeferenced=current(self._on_georeferenced),
+            given=current(self._on_given),
             warned=warned,
             localisation_died=lambda: self._soon(self._starts.localisation_died, flight),
             unusable=lambda why: self._soon(self._starts.stage_unusable, why),
-            snapshot=current(self._on_snapshot),
             results_written=self._on_results_written,
             points_made=current(self._watch.points_made),
             mapped=current(reports.take) if reports is not None else None,
         )
 
-    def _on_odometry(self, odometry: Odometry) -> None:
-        if odometry.seq < NO_PICTURE:
-            self._watch.take_odometry(odometry)
+    def _on_given(self, message: Given) -> None:
+        """Take an output of the current flight's stages."""
+        if isinstance(message, Snapshot):
             if self._ground is not None:
-                self._ground.way_back.take_odometry(odometry)
+                self._ground.snapshot_told(message)
+        elif isinstance(message, Georeferenced):
+            self._watch.take_georeference(message)
+            if self._ground is not None:
+                self._ground.way_back.take_georeference(message)
+        elif isinstance(message, Odometry) and message.seq < NO_PICTURE:
+            self._watch.take_odometry(message)
+            if self._ground is not None:
+                self._ground.way_back.take_odometry(message)
         if self._senders is not None:
-            self._senders.take_odometry(odometry)
-
-    def _on_georeferenced(self, told: Georeferenced) -> None:
-        self._watch.take_georeference(told)
-        if self._ground is not None:
-            self._ground.way_back.take_georeference(told)
-        if self._senders is not None:
-            self._senders.take_georeference(told)
-
-    def _on_snapshot(self, snapshot: Snapshot) -> None:
-        if self._ground is not None:
-            self._ground.snapshot_told(snapshot)
+            self._senders.take(message)
 
     def _on_results_written(self, written: ResultsWritten) -> None:
         if written.why_not:

@@ -16,7 +16,7 @@ from companion import __version__
 from companion.config import Config
 from companion.daemon.flights.flights import Flights
 from companion.daemon.flights.viewing import VIEWERS
-from companion.daemon.pose.senders import Senders, SentHealth
+from companion.daemon.pose.senders import Senders
 from companion.health import (
     ComputerLoad,
     Health,
@@ -247,7 +247,6 @@ class HealthWatch:
         now_ns, flight = self._clock.now_ns(), self._flights.current
         odometry = self._odometry if flight is not None else None
         pose = self._pose.health(now_ns)
-        sent = self._senders.health() if self._senders is not None else SentHealth()
         sources = [self._feed.health] + ([self._link.health] if self._link is not None else [])
         return Health(
             t_ns=now_ns,
@@ -259,10 +258,7 @@ class HealthWatch:
             scale=self._scale,
             refused={} if odometry is None else odometry.refused,
             pose_latency_p95_ms=pose.latency_p95_ms,
-            feedback=sent.feedback,
-            flow=sent.flow,
-            landing=sent.landing,
-            global_position=sent.global_position,
+            **(self._senders.health() if self._senders is not None else {}),
             flight=flight.folder.name if flight and flight.folder and flight.kept else "",
             load=self.load,
             degradation=self._governor.level.number,

@@ -36,10 +36,19 @@ from companion.config import Config
 from companion.config_file import load_config
 from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.flights import Flights
-from companion.daemon.flights.live_flight import Listener, LiveFlight
+from companion.daemon.flights.live_flight import Given, Listener, LiveFlight
 from companion.daemon.health_watch import HealthWatch
 from companion.geometry.camera import Camera
-from companion.messages import DepthMap, Frame, MapUpdate, Odometry, PointChunk, Track, Warned
+from companion.messages import (
+    DepthMap,
+    Frame,
+    Georeferenced,
+    MapUpdate,
+    Odometry,
+    PointChunk,
+    Track,
+    Warned,
+)
 from companion.messages.run_facts import RunFacts
 from companion.meters import LatencyMeter
 from companion.runtime.fork_server import ForkServer
@@ -116,11 +125,14 @@ class Flown:
         assert self._answered.wait(ANSWER_S), f"no answer to frame {frame.seq}"
         time.sleep(max(0.0, began_s + LEAST_FRAME_S - time.monotonic()))
 
-    def _odometry(self, odometry: Odometry) -> None:
-        self.watch.take_odometry(odometry)
-        self._seen.n_tracked += odometry.quality > 0
-        if odometry.seq >= self._seq:
-            self._answered.set()
+    def _given(self, message: Given) -> None:
+        if isinstance(message, Georeferenced):
+            self.watch.take_georeference(message)
+        elif isinstance(message, Odometry):
+            self.watch.take_odometry(message)
+            self._seen.n_tracked += message.quality > 0
+            if message.seq >= self._seq:
+                self._answered.set()
 
     def _mapped(self, message: Track | MapUpdate | DepthMap | PointChunk) -> None:
         if isinstance(message, MapUpdate):
@@ -134,8 +146,7 @@ class Flown:
             raise AssertionError("localisation has died")
 
         return Listener(
-            self._odometry,
-            self.watch.take_georeference,
+            self._given,
             self._warned,
             died,
             lambda why: None,

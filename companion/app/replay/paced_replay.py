@@ -11,9 +11,9 @@ from companion.app.progress import Progress
 from companion.app.replay.replay_command import RecordedInput, Watched
 from companion.config import Config
 from companion.daemon.flights.flight_facts import facts_of
-from companion.daemon.flights.live_flight import Listener, LiveFlight
+from companion.daemon.flights.live_flight import Given, Listener, LiveFlight
 from companion.errors import StageError
-from companion.messages import Frame, FrameOverdue, Odometry, Warned
+from companion.messages import Frame, FrameOverdue, Georeferenced, Odometry, Warned
 from companion.messages.run_facts import RunFacts
 from companion.runtime.fork_server import ForkServer
 from companion.runtime.stages import START_S
@@ -47,14 +47,17 @@ def replay_paced(
         notify(f"{warning.what}: {warning.detail}" if warning.detail else warning.what)
         flight.take(warning)
 
-    def odometry(message: Odometry) -> None:
-        watched.see(message.state)
+    def given_out(message: Given) -> None:
+        if isinstance(message, Odometry):
+            watched.see(message.state)
+        elif isinstance(message, Georeferenced):
+            watched.take(message)
 
     server = ForkServer()
     flight = LiveFlight(
         live, given.flight.camera, FlightClock(),
         lambda _: Listener(
-            odometry, watched.take, warned, lambda: unusable("localisation has died"), unusable,
+            given_out, warned, lambda: unusable("localisation has died"), unusable,
             mapped=watched.take,
         ),
         server.start,

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import get_args
 
 from companion.config import Config, Measurement
 from companion.daemon.flights.viewing import NOWHERE, VIEWERS, Viewing
@@ -61,6 +62,8 @@ NOT_DENSE = "the dense map cannot be begun now; switch it off and on to try agai
 NOT_FINISHED = "a stage did not give its last results in time"
 HEALTH_EVERY_NS = 1_000_000_000
 GATHER_NS = round(GATHER_S * 1e9)
+Given = Odometry | OpticalFlow | LandingTarget | Georeferenced | Snapshot
+GIVEN = {kind.__name__ for kind in get_args(Given)}
 MAPPED = {kind.__name__ for kind in (Track, MapUpdate, DepthMap, PointChunk)}
 
 
@@ -68,15 +71,11 @@ MAPPED = {kind.__name__ for kind in (Track, MapUpdate, DepthMap, PointChunk)}
 class Listener:
     """Callbacks for the output of a flight; called from its threads, must not block."""
 
-    odometry: Callable[[Odometry], None]
-    georeferenced: Callable[[Georeferenced], None]
+    given: Callable[[Given], None]
     warned: Callable[[Warned], None]
     localisation_died: Callable[[], None]
     unusable: Callable[[str], None]
     """A stage could never start because of the user's input."""
-    flow: Callable[[OpticalFlow], None] = lambda _: None
-    landing: Callable[[LandingTarget], None] = lambda _: None
-    snapshot: Callable[[Snapshot], None] = lambda _: None
     results_written: Callable[[ResultsWritten], None] = lambda _: None
     points_made: Callable[[int], None] = lambda _: None
     """Time of the keyframe whose points they are."""
@@ -315,23 +314,16 @@ class LiveFlight:
 
     def _hear(self, parcel: Parcel) -> None:
         """Take a message of a stage; called from the stages' threads."""
-        if parcel.kind == Odometry.__name__:
-            self._listener.odometry(parcel.open())
+        if parcel.kind in GIVEN:
+            given: Given = parcel.open()
+            if isinstance(given, Georeferenced):
+                self.has_origin = given.georeference is not None and given.georeference.has_origin
+            self._listener.given(given)
         elif parcel.kind == Listening.__name__:
             if self._viewing is not None:
                 self._viewing.take_port(parcel.open().port)
-        elif parcel.kind == OpticalFlow.__name__:
-            self._listener.flow(parcel.open())
-        elif parcel.kind == LandingTarget.__name__:
-            self._listener.landing(parcel.open())
-        elif parcel.kind == Snapshot.__name__:
-            self._listener.snapshot(parcel.open())
         elif parcel.kind == ResultsWritten.__name__:
             self._listener.results_written(parcel.open())
-        elif parcel.kind == Georeferenced.__name__:
-            told: Georeferenced = parcel.open()
-            self.has_origin = told.georeference is not None and told.georeference.has_origin
-            self._listener.georeferenced(told)
         elif parcel.kind == Warned.__name__:
             self._listener.warned(parcel.open())
             if not self._processes.over:

@@ -5,10 +5,11 @@ Runs in the event loop. What is sent of it is decided by `companion.estimation.g
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict
 
-from companion.config import FeedbackConfig
+from companion.config import FeedbackConfig, Measurement
+from companion.daemon.pose.sender import Sender
 from companion.estimation.gate.flow_gate import FlowGate
 from companion.estimation.gate.gate_journal import FLOW, GateJournal
 from companion.estimation.gate.gates_again import FRAME, LIMITS
@@ -25,11 +26,13 @@ SILENT_NS = 1_000_000_000
 UNHEARD, NO_FLOW = "the autopilot is silent", "no frame"
 
 
-class FlowSender:
+class FlowSender(Sender):
     """Optical flow of the current flight in; OPTICAL_FLOW or OPTICAL_FLOW_RAD out, or nothing.
 
     `journal` takes what the gate was asked.
     """
+
+    name = "flow"
 
     def __init__(
         self, config: FeedbackConfig, link: AutopilotLink, clock: FlightClock,
@@ -42,14 +45,15 @@ class FlowSender:
         self._quality = 0
         self._why_not = ""
         self._n_sent = 0
+        self.takes = {AttitudeSample: self.take_attitude, OpticalFlow: self.take}
 
-    def begin_flight(self) -> None:
-        """Begin anew with another flight, and its recording."""
+    def begin_flight(self, use: Collection[Measurement]) -> None:
+        """Begin anew with another flight, of whose telemetry is believed what is in `use`."""
         self._gate = FlowGate(self._config)
         self._journal.begin(self._clock.now_ns(), {})
 
     def reconfigure(self, config: FeedbackConfig) -> None:
-        """Send another message from the next frame on, or none."""
+        """Apply another configuration, from the next message on."""
         self._config = config
         self._gate.reconfigure(config)
         self._journal.step(LIMITS, self._clock.now_ns(), {"limits": asdict(config)})

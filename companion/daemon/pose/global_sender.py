@@ -10,13 +10,14 @@ from collections.abc import Callable, Collection
 from dataclasses import asdict, astuple
 
 from companion.config import FeedbackConfig, Measurement
+from companion.daemon.pose.sender import Sender
 from companion.estimation.gate.gate_journal import GLOBAL, GateJournal
 from companion.estimation.gate.gates_again import DOUBT, FRAME, LIMITS, PLACED, placed_values
 from companion.estimation.gate.global_gate import GlobalGate
 from companion.estimation.gate.pose_gate import PoseGate
 from companion.flight_notes import GateStep
 from companion.health import FeedbackHealth
-from companion.messages import Georeferenced, Odometry
+from companion.messages import Georeferenced, Odometry, Warned
 from companion.meters import RateMeter
 from companion.pilot_messages import GLOBAL_OFF, GLOBAL_ON
 from companion.telemetry import AttitudeSample, PositionSample
@@ -29,11 +30,13 @@ LOST_NS = 3_000_000_000
 UNHEARD = "the autopilot is silent"
 
 
-class GlobalSender:
+class GlobalSender(Sender):
     """Odometry of the current flight in; the message of `feedback.global_position` out.
 
     `journal` takes what the gates were asked.
     """
+
+    name = "global_position"
 
     def __init__(
         self,
@@ -50,9 +53,13 @@ class GlobalSender:
         self._n_sent, self._sent_ns, self._sigma_m = 0, 0, 0.0
         self._why_not = ""
         self._is_told = False
+        self.takes = {
+            AttitudeSample: self.take_attitude, PositionSample: self.take_position,
+            Odometry: self.take, Georeferenced: self.take_georeference, Warned: self.take_warning,
+        }  # fmt: skip
 
     def reconfigure(self, config: FeedbackConfig) -> None:
-        """Apply other limits, from the next position on."""
+        """Apply another configuration, from the next message on."""
         self._config = config
         self._poses.reconfigure(config)
         self._gate.reconfigure(config)
@@ -74,17 +81,14 @@ class GlobalSender:
         self._journal.step(PLACED, self._clock.now_ns(), placed_values(told.georeference))
 
     def begin_flight(self, use: Collection[Measurement]) -> None:
-        """Begin anew with another flight: its localisation knows nothing of the one before.
-
-        Of telemetry it believes what is in `use`.
-        """
+        """Begin anew with another flight, of whose telemetry is believed what is in `use`."""
         satellites_ns = self._gate.satellites_ns
         self._poses, self._gate = PoseGate(self._config, use=use), GlobalGate(self._config, use)
         self._gate.satellites_ns = satellites_ns
         self._journal.begin(self._clock.now_ns(), {"satellites_ns": satellites_ns})
 
     def doubt_satellites(self, doubted: bool) -> None:
-        """Satellites are doubted, or are not any more."""
+        """Doubt satellites, or doubt them no more."""
         self._gate.doubted = doubted
         self._journal.step(DOUBT, self._clock.now_ns(), {"doubted": doubted})
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 from companion.config import LandingConfig, Measurement
+from companion.daemon.pose.sender import Sender
 from companion.estimation.gate.gate_journal import LANDING, GateJournal
 from companion.estimation.gate.gates_again import FRAME
 from companion.estimation.landing.landing_gate import LandingGate
@@ -27,11 +28,13 @@ LOST_NS = 1_000_000_000
 UNHEARD, NO_POSITION = "the autopilot is silent", "no local position from the autopilot"
 
 
-class LandingSender:
+class LandingSender(Sender):
     """Landing targets of the current flight in; LANDING_TARGET out, or nothing.
 
     Of telemetry it believes what is in `use`. `journal` takes what the gate was asked.
     """
+
+    name = "landing"
 
     def __init__(
         self,
@@ -49,6 +52,7 @@ class LandingSender:
         self._distance_m: float | None = None
         self._why_not = ""
         self._is_told = False
+        self.takes = {AttitudeSample: self.take_attitude, LandingTarget: self.take}
 
     def begin_flight(self, use: Collection[Measurement]) -> None:
         """Begin anew with another flight, of whose telemetry is believed what is in `use`."""

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from companion.config import FeedbackConfig, Measurement
+from companion.daemon.pose.sender import Sender
 from companion.daemon.pose.sent_counter import SentCounter
 from companion.estimation.gate.pose_gate import Sending
 from companion.estimation.gate.pose_journal import JournaledPoseGate
@@ -46,12 +47,14 @@ SAY_WHY_AFTER_NS, SAY_WHY_EVERY_NS = 30_000_000_000, 60_000_000_000
 """Without a pose for the first, the pilot is told why, and again after the second."""
 
 
-class PoseSender:
+class PoseSender(Sender):
     """Odometry of the current flight in; ODOMETRY or VISION_POSITION_ESTIMATE out, or nothing.
 
     The file at `counter_path` keeps the reset counter sent, for the next process. `journal` takes
     what the gate was asked.
     """
+
+    name = "feedback"
 
     def __init__(
         self,
@@ -82,6 +85,7 @@ class PoseSender:
         self._said_why_ns = 0
         link.sends_poses = config.mode != "off"
         self._bridging_since_ns: int | None = None
+        self.takes = {AttitudeSample: self.take_attitude, Odometry: self.take}
 
     def _may_start(self, now_ns: int) -> str:
         """Reason why no first pose of a sequence may be sent now; "" if it may."""
@@ -102,11 +106,11 @@ class PoseSender:
         self._gate.restart()
 
     def begin_flight(self, use: Collection[Measurement]) -> None:
-        """A flight has begun, and its recording; of telemetry it believes what is in `use`."""
+        """Begin anew with another flight, of whose telemetry is believed what is in `use`."""
         self._gate.begin(use)
 
     def reconfigure(self, config: FeedbackConfig) -> None:
-        """Apply other limits, from the next pose on, or another message."""
+        """Apply another configuration, from the next message on."""
         self._config = config
         self._link.sends_poses = config.mode != "off"
         self._gate.reconfigure(config)

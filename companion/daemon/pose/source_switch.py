@@ -7,9 +7,10 @@ event loop.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
-from companion.config import GpsConfig
+from companion.config import GpsConfig, Measurement
+from companion.daemon.pose.sender import Sender
 from companion.estimation.gate.gate_journal import SOURCES, GateJournal
 from companion.estimation.gate.gates_again import ANSWERED, ASKED, BOOTED, DOUBT
 from companion.estimation.satellites.source_choice import SourceChoice
@@ -27,7 +28,7 @@ ACCEPTED = 0
 NOT_SWITCHED = "the EKF's sources could not be switched"
 
 
-class SourceSwitch:
+class SourceSwitch(Sender):
     """Changes the EKF source set by the verdict on satellites.
 
     `sending` is True with poses; `journal` takes what the choice was made of.
@@ -47,9 +48,10 @@ class SourceSwitch:
         self._choice = SourceChoice(config)
         self._n_reboots = link.clock_filter.n_reboots
         self._journal = GateJournal(SOURCES, journal)
+        self.takes = {Warned: self.take_warning}
 
-    def begin_flight(self) -> None:
-        """Another flight begins: its localisation knows nothing of a doubt."""
+    def begin_flight(self, use: Collection[Measurement]) -> None:
+        """Begin anew with another flight, of whose telemetry is believed what is in `use`."""
         choice = self._choice
         choice.begin_flight()
         known = {
@@ -59,7 +61,7 @@ class SourceSwitch:
         self._journal.begin(self._clock.now_ns(), known)
 
     def doubt_satellites(self, doubted: bool) -> None:
-        """Satellites are doubted, or are not any more."""
+        """Doubt satellites, or doubt them no more."""
         self._choice.doubt_satellites(doubted)
         self._journal.step(DOUBT, self._clock.now_ns(), {"doubted": doubted})
 

@@ -185,7 +185,7 @@ def test_its_journal_gives_the_messages_again(
     vehicle.run(0.3)
     vehicle.attitudes.clear()
     n_before = len(vehicle.sent)
-    vehicle.sender.begin_flight()
+    vehicle.sender.begin_flight(())
     vehicle.run(0.5)
     vehicle.rates_told = False
     vehicle.run(0.6)

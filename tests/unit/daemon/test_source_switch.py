@@ -48,7 +48,7 @@ class Vehicle:
     async def begin(self) -> None:
         await listen(self.link)
         self.hear(armed=True)
-        self.switch.begin_flight()
+        self.switch.begin_flight(())
 
     def hear(self, armed: bool) -> None:
         mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
@@ -155,7 +155,7 @@ def test_a_doubt_outlives_its_flight_in_the_air_only() -> None:
         await vehicle.begin()
         vehicle.switch.doubt_satellites(True)
         await vehicle.step()
-        vehicle.switch.begin_flight()  # localisation has died in the air
+        vehicle.switch.begin_flight(())  # localisation has died in the air
         await vehicle.step()
         assert vehicle.sets == [3]
         vehicle.hear(armed=False)
@@ -175,7 +175,7 @@ def test_another_flight_asks_again_what_its_journal_has() -> None:
         await vehicle.step()
         vehicle.steps.clear()
         n_before = len(vehicle.commands)
-        vehicle.switch.begin_flight()
+        vehicle.switch.begin_flight(())
         for armed in (True, False, True):
             vehicle.hear(armed)
             await vehicle.step()
