@@ -17,6 +17,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.calibration.board_edges import edge_px, refined_corners
+from companion.calibration.other_boards import (
+    chessboard_seen,
+    dictionaries,
+    dictionary_of,
+    markers_seen,
+    other_dictionary,
+    some_of,
+)
 from companion.errors import InputError
 from companion.geometry.transforms import Array
 from companion.messages import Bytes
@@ -30,10 +39,6 @@ MIN_CORNERS = 8
 """Corners required of a detection."""
 SEARCH_WIDTH_PX = 1600
 """Larger images are searched for a chessboard at this width, then refined at full size."""
-N_FIRST = 50
-"""Markers of each dictionary tried, to identify the one of a board."""
-MAX_TRIED = 4
-"""Images searched for other boards, when the given one was not found."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,14 +95,14 @@ def parse_chart(text: str) -> Chart:
     if not 0.3 * square_m <= marker_m <= 0.95 * square_m:
         raise InputError(f"--board {text}: the marker must be 0.3 to 0.95 of the square")
     name = parts[3].upper()
-    if name not in _dictionaries():
+    if name not in dictionaries():
         raise InputError(
-            f"--board {text}: unknown dictionary; known are " + ", ".join(_dictionaries())
+            f"--board {text}: unknown dictionary; known are " + ", ".join(dictionaries())
         )
-    if columns * rows // 2 > len(_dictionary(name).bytesList):
+    if columns * rows // 2 > len(dictionary_of(name).bytesList):
         raise InputError(
             f"--board {text}: it has {columns * rows // 2} markers, {name} only "
-            f"{len(_dictionary(name).bytesList)}"
+            f"{len(dictionary_of(name).bytesList)}"
         )
     return CharucoChart(text.strip(), columns, rows, square_m, marker_m, name, legacy)
 
@@ -115,7 +120,7 @@ class CharucoChart:
         self._dictionary, self._legacy = dictionary, legacy
         # OpenCV uses float32 lengths: in units of squares they are exact enough
         self._board = cv2.aruco.CharucoBoard(
-            (n_across, n_down), 1.0, marker_m / square_m, _dictionary(dictionary)
+            (n_across, n_down), 1.0, marker_m / square_m, dictionary_of(dictionary)
         )
         self._board.setLegacyPattern(legacy)
         careful = cv2.aruco.CharucoParameters()
@@ -134,10 +139,10 @@ class CharucoChart:
 
     def explain(self, greys: Sequence[Bytes]) -> str | None:
         """Contents of grey images without the board, as a clause; None if unknown."""
-        tried = _spread(greys, MAX_TRIED)
-        seen = _markers_seen(tried, self._dictionary)
+        tried = some_of(greys)
+        seen = markers_seen(tried, dictionary_of(self._dictionary))
         if not seen:
-            return _other_dictionary(tried) or _chessboard_seen(tried, self)
+            return other_dictionary(tried) or chessboard_seen(tried, (self.columns, self.rows))
         for other in self._variants():
             if any(other.find(grey) is not None for grey in tried):
                 return f"what is to be seen is --board {other.name}"
@@ -165,7 +170,10 @@ class CharucoChart:
                     out.append([column, row, 1.0, 1.0])
                 else:
                     out += _marker(
-                        _dictionary(self._dictionary), int(numbers[i]), corners[i, 0], corners[i, 2]
+                        dictionary_of(self._dictionary),
+                        int(numbers[i]),
+                        corners[i, 0],
+                        corners[i, 2],
                     )
         return np.array(out, np.float64) * self.square_m
 
@@ -212,13 +220,13 @@ class ChessboardChart:
         if not found:
             return None
         image_px = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
-        image_px = _refined(grey, image_px, self.columns)
+        image_px = refined_corners(grey, image_px, self.columns)
         return _detection(self, grey, np.arange(self.columns * self.rows), image_px)
 
     def explain(self, greys: Sequence[Bytes]) -> str | None:
         """Contents of grey images without the board, as a clause; None if unknown."""
-        tried = _spread(greys, MAX_TRIED)
-        return _other_dictionary(tried) or _chessboard_seen(tried, None)
+        tried = some_of(greys)
+        return other_dictionary(tried) or chessboard_seen(tried)
 
     def black_m(self) -> Array:
         """Black rectangles (N, 4), metres."""
@@ -239,18 +247,6 @@ def _length(text: str, word: str) -> float:
     if not 1e-4 <= value <= 10:
         raise InputError(f"--board {text}: {word!r} is no length in metres; wanted {CHART_FORMS}")
     return value
-
-
-def _dictionaries() -> list[str]:
-    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_") and name == name.upper()]
-    # of dictionaries with common first markers the smaller one first
-    return sorted(
-        names, key=lambda name: (name.rpartition("_")[0], len(_dictionary(name).bytesList))
-    )
-
-
-def _dictionary(name: str) -> cv2.aruco.Dictionary:
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
 def _marker(
@@ -279,109 +275,4 @@ def _detection(
     if len(np.unique(column)) < 2 or len(np.unique(row)) < 2:
         return None
     board_m = np.stack([column + 1.0, row + 1.0, 0.0 * row], 1) * chart.square_m
-    return Detection(ids, image_px, board_m, _edge_px(grey, ids, image_px, chart.columns))
-
-
-def _refined(grey: Bytes, image_px: Array, columns: int) -> Array:
-    """Sub-pixel corners, from windows that contain their edges only."""
-    grid = image_px.reshape(-1, columns, 2)
-    gap_px = min(
-        float(np.linalg.norm(np.diff(grid, axis=0), axis=-1).min()),
-        float(np.linalg.norm(np.diff(grid, axis=1), axis=-1).min()),
-    )
-    half = int(np.clip(0.3 * gap_px, 2, 12))
-    corners = image_px.astype(np.float32).reshape(-1, 1, 2)
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 40, 0.001)
-    refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop)
-    return np.asarray(refined, np.float64).reshape(-1, 2)
-
-
-def _edge_px(grey: Bytes, ids: NDArray[np.int64], image_px: Array, columns: int) -> float:
-    """Contrast over steepest slope, across edges between neighbouring corners.
-
-    Motion blur is directional, so both directions are measured, and the larger width counts. nan
-    without neighbouring corners.
-    """
-    place = {int(number): at for at, number in enumerate(ids)}
-    widths = []
-    for step in (1, columns):
-        pairs = [
-            (place[number], place[number + step])
-            for number in place
-            if number + step in place and (step > 1 or (number + 1) % columns)
-        ]
-        if pairs:
-            widths.append(_edge_width(grey, image_px[np.array(pairs)]))
-    return max(widths) if widths else math.nan
-
-
-def _edge_width(grey: Bytes, ends_px: Array) -> float:
-    """Median over edges with these end points, (N, 2, 2)."""
-    along = ends_px[:, 1] - ends_px[:, 0]
-    length = np.linalg.norm(along, axis=1)
-    across = np.stack([-along[:, 1], along[:, 0]], 1) / length[:, None]
-    reach_px = float(np.clip(0.25 * np.median(length), 2.0, 15.0))
-    offsets = np.arange(-reach_px, reach_px + 1e-6, 0.5)
-    at = np.array([0.4, 0.5, 0.6])
-    middles = ends_px[:, 0, None] + at[:, None] * along[:, None]  # (N, 3, 2)
-    samples = middles[:, :, None] + offsets[:, None] * across[:, None, None]
-    flat = samples.reshape(-1, len(offsets), 2).astype(np.float32)
-    bright = np.asarray(
-        cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR,
-                  borderMode=cv2.BORDER_REPLICATE),
-        np.float64,
-    ).reshape(len(ends_px), 3, -1).mean(1)  # fmt: skip
-    slope = np.abs(bright[:, 2:] - bright[:, :-2]).max(1)  # samples are half a pixel apart
-    contrast = np.percentile(bright.max(1), 75) - np.percentile(bright.min(1), 25)
-    return float(np.median(contrast / np.maximum(slope, 1e-3)))
-
-
-def _spread(greys: Sequence[Bytes], n: int) -> list[Bytes]:
-    at = np.unique(np.linspace(0, len(greys) - 1, min(n, len(greys))).round().astype(int))
-    return [greys[i] for i in at]
-
-
-def _markers_seen(greys: Sequence[Bytes], dictionary: str) -> set[int]:
-    """Numbers of the markers in images that show at least two."""
-    return _seen(greys, _dictionary(dictionary))
-
-
-def _seen(greys: Sequence[Bytes], dictionary: cv2.aruco.Dictionary) -> set[int]:
-    detector = cv2.aruco.ArucoDetector(dictionary)
-    seen: set[int] = set()
-    for grey in greys:
-        _, ids, _ = detector.detectMarkers(grey)
-        if ids is not None and len(ids) >= 2:
-            seen |= {int(number) for number in np.ravel(ids)}
-    return seen
-
-
-def _other_dictionary(greys: Sequence[Bytes]) -> str | None:
-    """A dictionary of which an image shows enough markers not to be chance."""
-    families: dict[str, tuple[str, cv2.aruco.Dictionary]] = {}
-    for name in _dictionaries():
-        stem, _, count = name.rpartition("_")
-        full = _dictionary(name)
-        # the smallest of those with common first markers, which boards use
-        first = cv2.aruco.Dictionary(
-            full.bytesList[:N_FIRST], full.markerSize, full.maxCorrectionBits
-        )
-        families.setdefault(stem if count.isdigit() else name, (name, first))
-    for grey in greys:
-        counts = {name: len(_seen([grey], first)) for name, first in families.values()}
-        best = max(counts, key=lambda name: counts[name])
-        if counts[best] >= 4:
-            return f"markers of {best} are to be seen, {counts[best]} of them in one picture"
-    return None
-
-
-def _chessboard_seen(greys: Sequence[Bytes], own: CharucoChart | None) -> str | None:
-    for grey in greys:
-        found, _, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), cv2.CALIB_CB_LARGER)
-        if not found or meta is None:
-            continue
-        rows, columns = sorted(np.asarray(meta).shape[:2])
-        if own is None or rows > min(own.rows, own.columns) or columns > max(own.rows, own.columns):
-            return f"a chessboard of {columns}x{rows} inner corners is to be seen"
-        return "squares are to be seen, but no markers: bring the board nearer, and focus the lens"
-    return None
+    return Detection(ids, image_px, board_m, edge_px(grey, ids, image_px, chart.columns))

@@ -13,7 +13,8 @@ from dataclasses import replace
 from companion.config import Config, DaemonConfig, FeedbackConfig
 from companion.daemon.control.settings_in_force import SettingsInForce
 from companion.daemon.flights.flights import Flights
-from companion.daemon.flights.live_flight import LiveFlight, makes_depth
+from companion.daemon.flights.flown_stages import makes_depth
+from companion.daemon.flights.live_flight import LiveFlight
 from companion.daemon.health_watch import HealthWatch
 from companion.daemon.pose.senders import Senders
 from companion.daemon.stop_request import BAD_INPUT, StopRequest

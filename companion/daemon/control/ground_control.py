@@ -24,7 +24,7 @@ from companion.daemon.control.flight_parameters import (
 from companion.daemon.control.tightening import may_change
 from companion.daemon.control.way_back import WayBack
 from companion.daemon.flights.flights import Flights
-from companion.daemon.flights.live_flight import depth_elsewhere
+from companion.daemon.flights.flown_stages import depth_elsewhere
 from companion.daemon.flights.new_map import NewMap
 from companion.daemon.flights.snapshots import Snapshots
 from companion.errors import ConfigError

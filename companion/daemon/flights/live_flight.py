@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import get_args
 
 from companion.config import Config, Measurement
-from companion.daemon.flights.viewing import NOWHERE, VIEWERS, Viewing
+from companion.daemon.flights.flown_stages import VIDEO, makes_depth, stages_of
+from companion.daemon.flights.viewing import VIEWERS, Viewing
 from companion.flight_notes import FlightNote, LinkBytes, LinkReads
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
@@ -49,11 +50,10 @@ from companion.runtime.stage_protocol import (
     WriteResults,
 )
 from companion.runtime.stage_start import Start
-from companion.runtime.stages import STAGES, Stage, stage_named
+from companion.runtime.stages import Stage, stage_named
 from companion.telemetry import Telemetry
 from companion.timing.clock import FlightClock, monotonic_s
 
-VIDEO = "video"
 SHOWN = (VIEWERS, VIDEO)
 """Stages whose pictures are left out first."""
 RESTARTED = "a stage has died and is started again"
@@ -346,40 +346,3 @@ class LiveFlight:
 
     def _warn(self, what: str, detail: str, good: bool = False) -> None:
         self._listener.warned(Warned(self._clock.now_ns(), what, detail, good))
-
-
-def stages_of(config: Config) -> list[Stage]:
-    """Stages of a live flight."""
-    left_out = set()
-    if config.daemon.viewer == NOWHERE and not (config.stream.listen or config.page.listen):
-        left_out.add(VIEWERS)
-    if not config.recorder.enabled:
-        left_out.add("recorder")
-    if not makes_depth(config):
-        left_out.add("depth")
-    if config.landing.marker == "off":
-        left_out.add("landing")
-    if not config.video.listen:
-        left_out.add(VIDEO)
-    if not config.distributed.enabled:
-        left_out.add("topics")
-    rows = [stage for stage in STAGES if stage.name not in left_out]
-    if config.recorder.point_cloud:
-        return rows
-    unwanted = (MapUpdate, PointChunk)
-    return [
-        replace(row, listens=tuple(kind for kind in row.listens if kind not in unwanted))
-        if row.name == "recorder"
-        else row
-        for row in rows
-    ]
-
-
-def depth_elsewhere(config: Config) -> bool:
-    """True if another machine makes the dense map."""
-    return config.distributed.enabled and "depth" not in config.distributed.stages
-
-
-def makes_depth(config: Config) -> bool:
-    """True if the dense map is made on this machine."""
-    return config.depth.enabled and not depth_elsewhere(config)
