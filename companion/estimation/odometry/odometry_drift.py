@@ -28,10 +28,14 @@ ALONG_ONE = float(np.sqrt(3.841 / 7.815))
 
 
 class _PathPoint(NamedTuple):
-    """Position, path length, variance of the walk, and accumulated slew correction at a time."""
+    """Position, path length, variance of the walk, and accumulated slew correction at a time.
+
+    `scaled_m` (3,) is the way so far, each part times the standard deviation of its scale then.
+    """
 
     t_ns: int
     position: Array
+    scaled_m: Array
     path_length_m: float
     walked_m2: float
     slewed: Array
@@ -78,18 +82,20 @@ class OdometryDrift:
         `noise_m` is that of its image alone, 0 where it comes of none. Standard deviations are
         along each axis.
         """
-        path_length_m, walked_m2 = 0.0, 0.0
+        scaled_m, path_length_m, walked_m2 = np.zeros(3), 0.0, 0.0
         if self._path:
             last = self._path[-1]
-            path_length_m = last.path_length_m + float(np.linalg.norm(position - last.position))
+            moved_m = position - last.position
+            scaled_m = last.scaled_m + sigma_scale * moved_m
+            path_length_m = last.path_length_m + float(np.linalg.norm(moved_m))
             walked_m2 = last.walked_m2 + self._new_share * noise_m**2
-        self._path.append(_PathPoint(t_ns, position, path_length_m, walked_m2, slewed))
+        self._path.append(_PathPoint(t_ns, position, scaled_m, path_length_m, walked_m2, slewed))
         while self._path[0].t_ns < t_ns - WINDOW_NS:
             self._path.popleft()
         since = self._path[0]
         calibration_m = SIGMA_CALIBRATION * (path_length_m - since.path_length_m)
         return Drift(
-            ALONG_ONE * sigma_scale * float(np.linalg.norm(position - since.position)),
+            ALONG_ONE * float(np.linalg.norm(scaled_m - since.scaled_m)),
             float(np.hypot(np.sqrt(max(walked_m2 - since.walked_m2, 0.0)), calibration_m)),
             float(np.linalg.norm(slewed - since.slewed)) / np.sqrt(3.0),
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.estimation.odometry.odometry_drift import OdometryDrift
+from companion.estimation.odometry.odometry_drift import ALONG_ONE, OdometryDrift
 
 SIGMA_SCALE = 0.02
 
@@ -19,6 +19,18 @@ def test_a_scale_that_is_off_exceeds_the_bound_as_often_as_it_should() -> None:
     squares = np.square(off[:, None] * way).sum(1) / stated_m**2
     assert float(np.mean(squares > 7.815)) == pytest.approx(0.05, abs=0.005)
     assert 0.5 < float(np.mean(squares)) / 3.0 < 1.0
+
+
+def test_a_scale_that_becomes_certain_leaves_the_way_before_as_uncertain_as_it_was() -> None:
+    """What it was off by then is in the places that were given out."""
+    drift = OdometryDrift()
+    for k in range(16):
+        sigma = 0.04 if k <= 5 else 0.01
+        found = drift.add(k * 10**9, np.array([2.0 * k, 0.0, 0.0]), sigma, np.zeros(3))
+        if k == 10:
+            way_m = 5 * 2.0 * 0.04 + 5 * 2.0 * 0.01
+            assert found.by_scale_m == pytest.approx(ALONG_ONE * way_m)
+    assert found.by_scale_m == pytest.approx(ALONG_ONE * 20.0 * 0.01)
 
 
 def test_what_is_longer_ago_is_forgotten() -> None:
