@@ -244,13 +244,14 @@ def _feature_rows(keyframe: Keyframe) -> NDArray[np.void]:
 
 
 def _blocks(site: SiteMap) -> Iterator[tuple[int, bytes]]:
-    rows = np.zeros(len(site.points.positions), POINT)
-    for name in PointArrays._fields:
-        if name != "born":
-            rows[name] = getattr(site.points, name)
-    rows["covariance"] = site.covariances[:, UPPER[0], UPPER[1]]
-    for first in range(0, len(rows), BLOCK):
-        yield first, rows[first : first + BLOCK].tobytes()
+    for first in range(0, len(site.points.positions), BLOCK):
+        own = slice(first, first + BLOCK)
+        rows = np.zeros(len(site.points.positions[own]), POINT)
+        for name in PointArrays._fields:
+            if name != "born":
+                rows[name] = getattr(site.points, name)[own]
+        rows["covariance"] = site.covariances[own, UPPER[0], UPPER[1]]
+        yield first, rows.tobytes()
 
 
 # -- reading -------------------------------------------------------------------------------------

@@ -35,6 +35,7 @@ from companion.products.array_file import ArrayFile  # noqa: E402
 from companion.products.site_map_file import write_site_map  # noqa: E402
 from companion.runtime.in_order import in_order_of_time  # noqa: E402
 from companion.timing.clock import StageTimes  # noqa: E402
+from drivers.system.heap import bound_heap  # noqa: E402
 from tests.support.flights.rendered_flight import (  # noqa: E402
     CAMERA_DOWN,
     METRES_PER_TEXEL,
@@ -122,6 +123,7 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=12)
     parser.add_argument("--end", action="store_true")
     options = parser.parse_args()
+    bound_heap()
     stage, file = LocalisationStage(Config(), CAMERA, StageTimes()), ArrayFile(FOLDER)
     stage.put_far_into(file)
     pose_ms: list[float] = []

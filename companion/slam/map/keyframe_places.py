@@ -56,6 +56,12 @@ class KeyframePlaces:
         near = near[np.argsort(apart[near], kind="stable")][:most]
         return [k for k in self._ids[near].tolist() if k not in exclude][:n]
 
+    def centres(self, keyframes: Mapping[int, _Placed], first: int, last: int) -> Array:
+        """Centres (K, 3) of those from one id to another, in order."""
+        self._follow(keyframes)
+        ids = self._ids[: self._n]
+        return self._centres[: self._n][self._is_there[: self._n] & (ids >= first) & (ids <= last)]
+
     def poses(self, keyframes: Mapping[int, _Placed]) -> PoseTable:
         """`camera_from_map` of all, in order."""
         self._follow(keyframes)

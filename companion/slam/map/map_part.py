@@ -56,7 +56,10 @@ def part_around(slam_map: SlamMap, keyframe: Keyframe, most_bytes: int) -> MapPa
 
 
 def part_of(slam_map: SlamMap, chosen: Mapping[int, Keyframe]) -> MapPart:
-    """The part of the map that some keyframes, by id, and their points are; a copy."""
+    """The part of the map that some keyframes, by id, and their points are.
+
+    A copy, but for what is not changed any more.
+    """
     wanted = np.zeros(slam_map.n_points, bool)
     for keyframe in chosen.values():
         wanted[slam_map.observations_of(keyframe)[1]] = True
@@ -67,7 +70,8 @@ def part_of(slam_map: SlamMap, chosen: Mapping[int, Keyframe]) -> MapPart:
         replace(
             k, point_ids=index[k.point_ids],
             refined_for=np.where(k.refined_for == k.point_ids, index[k.point_ids], -1),
-            normalised=k.normalised.copy(), whitening=k.whitening.copy(), grey=None,
+            normalised=k.normalised if k.is_far else k.normalised.copy(),
+            whitening=k.whitening if k.is_far else k.whitening.copy(), grey=None, is_far=False,
         )
         for _, k in sorted(chosen.items())
     )  # fmt: skip

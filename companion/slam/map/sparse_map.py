@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.geometry.pose_table import PoseTable
 from companion.geometry.transforms import Array, Pose, Similarity
@@ -30,7 +31,7 @@ MAX_COVISIBLE_CANDIDATES = 60
 ARRAYS = (
     "observers", "positions", "alive", "descriptors", "normals", "base_distance", "n_visible",
     "n_found", "n_observers", "born", "first_seen", "first_unproject", "patch_at", "patch_centre",
-    "patch_level", "is_named",
+    "patch_level", "is_named", "_number",
 )  # fmt: skip
 
 
@@ -137,6 +138,8 @@ class SlamMap:
     patch_level: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     is_named: Bools = field(default_factory=lambda: np.zeros(0, bool))
     """Points (P,) that far keyframes name, dead or alive: their ids are not recycled."""
+    _number: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    """Of some points (P,) from 1 on, while these are looked at; else 0."""
     patches: PatchStore = field(default_factory=PatchStore)
     _free_ids: list[int] = field(default_factory=list)
     """Point ids to recycle, the lowest last."""
@@ -305,20 +308,21 @@ class SlamMap:
         """
         if len(points) == 0:
             return
-        row = np.full(self.n_points, -1, np.int32)
-        row[points] = np.arange(len(points))
+        number = self._number
+        number[points] = np.arange(1, len(points) + 1)
         total = np.zeros((len(points), 3))
         for keyframe in keyframes:
             features, ids = self.observations_of(keyframe)
-            chosen = row[ids] >= 0
+            chosen = number[ids] > 0
             features, ids = features[chosen], ids[chosen]
             towards = keyframe.centre - self.positions[ids]
             distance = np.linalg.norm(towards, axis=1)
-            total[row[ids]] += towards / np.maximum(distance, 1e-12)[:, None]
+            total[number[ids] - 1] += towards / np.maximum(distance, 1e-12)[:, None]
             self.base_distance[ids] = (
                 distance * self.scale_factor ** keyframe.features.octaves[features]
             )
             self.descriptors[ids] = keyframe.features.descriptors[features]
+        number[points] = 0
         norm = np.linalg.norm(total, axis=1)
         known = norm > 0
         self.normals[points[known]] = total[known] / norm[known][:, None]
@@ -365,6 +369,10 @@ class SlamMap:
     def nearest(self, centre: Array, n: int, exclude: set[int]) -> list[int]:
         """Ids of the `n` keyframes nearest to a position (3,), without those in `exclude`."""
         return self._places.nearest(self.keyframes, centre, n, exclude)
+
+    def centres(self, first: int, last: int) -> Array:
+        """Centres (K, 3) of the keyframes from one id to another, in order."""
+        return self._places.centres(self.keyframes, first, last)
 
     def spread_keyframes(self, most: int) -> list[Keyframe]:
         """All keyframes in order, or so many of them spread over the flight."""

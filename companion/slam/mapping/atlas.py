@@ -275,9 +275,7 @@ def _needs_pose_graph(found: LoopClosure) -> bool:
 def _within_drift(found: LoopClosure) -> bool:
     """True if drift along the path between the two keyframes explains the loop error."""
     first, last = sorted((found.keyframe.keyframe_id, found.relocalised.keyframe.keyframe_id))
-    centres = np.stack(
-        [k.centre for key, k in found.there.keyframes.items() if first <= key <= last]
-    )
+    centres = found.there.centres(first, last)
     path_length = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
     here = found.keyframe.centre
     off = float(np.linalg.norm(found.here_from_there.inverse().apply(here) - here))

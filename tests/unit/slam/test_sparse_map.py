@@ -78,6 +78,8 @@ def test_nearest_keyframes_are_those_of_a_search_of_all(slam_map: SlamMap) -> No
         exclude = set(random.choice(keys, 3).tolist())
         for n in (1, 4, len(keys)):
             assert slam_map.nearest(place, n, exclude) == searched(place, n, exclude)
+        centres = [f.centre for k, f in slam_map.keyframes.items() if 3 <= k <= 17]
+        np.testing.assert_array_equal(slam_map.centres(3, 17), centres)
         poses = slam_map.poses()
         assert list(poses) == list(slam_map.keyframes)
         for key, pose in poses.items():
