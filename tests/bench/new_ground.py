@@ -1,12 +1,14 @@
 """An hour over new ground: growth of the time per frame and of memory.
 
-    python -m tests.bench.new_ground [--frames 36000] [--rows 12] [--end]
+    python -m tests.bench.new_ground [--frames 36000] [--rows 12] [--copies 11] [--end]
 
 Lanes of a survey over ground of dead leaves that never repeats, rendered at 480x360 and 10
 frames/s, with the autopilot's telemetry; in lockstep, without dense depth. Prints a row for each
 twelfth of the flight: processor time until a frame's pose (median, 95th percentile), of a keyframe,
 what the process holds in memory (no page of a library), and in a file in the folder for temporary
-ones. With `--end` the flight then ends: how long that takes, and its largest memory.
+ones. With `--copies` the map is joined, after half of the flight, with so many copies of itself,
+each further away: it then is as large as after a flight so much longer. With `--end` the flight
+then ends: how long that takes, and its largest memory.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import resource
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
@@ -29,11 +32,17 @@ import psutil  # noqa: E402
 from companion.config import Config  # noqa: E402
 from companion.estimation.localisation import LocalisationStage  # noqa: E402
 from companion.geometry.camera import Camera  # noqa: E402
-from companion.geometry.transforms import Array, Pose, rotation_from_vector  # noqa: E402
+from companion.geometry.transforms import (  # noqa: E402
+    Array,
+    Pose,
+    Similarity,
+    rotation_from_vector,
+)
 from companion.messages import Bytes, Frame, KeyframeAdded, Odometry, TrackState  # noqa: E402
 from companion.products.array_file import ArrayFile  # noqa: E402
 from companion.products.site_map_file import write_site_map  # noqa: E402
 from companion.runtime.in_order import in_order_of_time  # noqa: E402
+from companion.slam.map.sparse_map import SlamMap  # noqa: E402
 from companion.timing.clock import StageTimes  # noqa: E402
 from drivers.system.heap import bound_heap  # noqa: E402
 from tests.support.flights.rendered_flight import (  # noqa: E402
@@ -51,6 +60,8 @@ LANE_M, APART_M = 600.0, 20.0
 N_PATTERNS, SIDE = 8, 512
 START_NS = 1_700_000_000_000_000_000
 FOLDER = Path(tempfile.gettempdir())
+COPIES_APART, IDS_APART = 1000.0, 100_000
+"""In map units, the first keyframes' distance; and of numbers of keyframes."""
 
 
 class NewGround(Terrain):
@@ -117,15 +128,45 @@ def frames(n: int) -> Iterator[Frame]:
         yield Frame(seq, START_NS + round(after_s * 1e9), grey, nothing)
 
 
+def join_copies(stage: LocalisationStage, file: ArrayFile, n: int) -> None:
+    """Join the map with copies of itself, as if these had been flown before."""
+    slam_map, database = stage._tracker.map, stage._tracker.atlas._database
+    keyframes, n_points = dict(slam_map.keyframes), slam_map.n_points
+    first = SlamMap(slam_map.scale_factor, slam_map.n_levels)
+    first.append_points(slam_map, Similarity.identity())
+    for i in range(1, n + 1):
+        away = np.array([i * COPIES_APART, 0.0, 0.0])
+        offset = slam_map.append_points(first, Similarity(1.0, np.eye(3), away))
+        ids = np.arange(offset, offset + n_points)
+        for each in (slam_map.observers, slam_map.born, slam_map.first_seen):
+            each[ids] -= np.where(each[ids] >= 0, i * IDS_APART, 0)
+        ids = ids[slam_map.patch_at[ids] >= 0]
+        (grey,) = file.put([slam_map.patches_of(ids).grey]) or [None]
+        slam_map.put_patches_away(ids, grey)
+        for key, keyframe in keyframes.items():
+            copy = replace(
+                keyframe, keyframe_id=key - i * IDS_APART,
+                camera_from_map=keyframe.camera_from_map @ Pose(np.eye(3), -away),
+                point_ids=np.where(keyframe.point_ids >= 0, keyframe.point_ids + offset, -1),
+                t_ns=keyframe.t_ns - i * 3_600_000_000_000, grey=None,
+            )  # fmt: skip
+            slam_map.keyframes[copy.keyframe_id] = copy
+            database.add(copy.keyframe_id, copy.features.descriptors)
+    slam_map.keyframes = dict(sorted(slam_map.keyframes.items()))
+    slam_map.keyframes_moved()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--frames", type=int, default=36_000)
     parser.add_argument("--rows", type=int, default=12)
+    parser.add_argument("--copies", type=int, default=0)
     parser.add_argument("--end", action="store_true")
     options = parser.parse_args()
     bound_heap()
     stage, file = LocalisationStage(Config(), CAMERA, StageTimes()), ArrayFile(FOLDER)
     stage.put_far_into(file)
+    stage._tracker._next_keyframe_id = options.copies * IDS_APART
     pose_ms: list[float] = []
     keyframe_ms: list[float] = []
     n_tracked = 0
@@ -158,6 +199,9 @@ def main() -> None:
                 flush=True,
             )  # fmt: skip
             pose_ms, keyframe_ms, n_tracked = [], [], 0
+        if options.copies and message.seq == options.frames // 2 - 1:
+            join_copies(stage, file, options.copies)
+            print(f"joined: {len(stage._tracker.map.keyframes)} keyframes", flush=True)
     if options.end:
         began_s = time.monotonic()
         stage.finish()
