@@ -69,7 +69,7 @@ WRITTEN: list[tuple[Telemetry, str, str]] = [
     ),
     (LandedSample(5, True), '{"landed":true}', "5,landed,1.0"),
 ]
-NUMBERS = '{"type": "array", "items": {"type": ["number", "null"]}}'
+NUMBERS = '{"type": "array", "items": {"type": "number"}}'
 SCHEMAS = {
     "attitude": '{"title": "companion.AttitudeSample", "description": "Attitude of the body (FRD) '
     'in NED: quaternion w x y z; body rates, rad/s", "type": "object", "properties": '
