@@ -31,7 +31,7 @@ MAX_COVISIBLE_CANDIDATES = 60
 ARRAYS = (
     "observers", "positions", "alive", "descriptors", "normals", "base_distance", "n_visible",
     "n_found", "n_observers", "born", "first_seen", "first_unproject", "patch_at", "patch_centre",
-    "patch_level", "is_named", "_number",
+    "patch_level", "is_named", "_number", "_marked",
 )  # fmt: skip
 
 
@@ -140,17 +140,19 @@ class SlamMap:
     """Points (P,) that far keyframes name, dead or alive: their ids are not recycled."""
     _number: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     """Of some points (P,) from 1 on, while these are looked at; else 0."""
+    _marked: Bools = field(default_factory=lambda: np.zeros(0, bool))
+    """Some points (P,), while these are looked at."""
     patches: PatchStore = field(default_factory=PatchStore)
     _free_ids: list[int] = field(default_factory=list)
-    """Point ids to recycle, the lowest last."""
+    """Point ids to recycle, the highest last: those of one place lie together."""
     _quarantined_ids: list[int] = field(default_factory=list)
     _quarantine_age: int = 0
 
     def _reserve(self, n: int) -> None:
         size = len(self.alive)
-        if n <= size:
+        if n < size:  # the last row is that of no point
             return
-        new = max(4096, 2 * size, n)
+        new = max(4096, 2 * size, n + 1)
         for name in ARRAYS:
             old = getattr(self, name)
             grown = np.zeros((new, *old.shape[1:]), old.dtype)
@@ -223,7 +225,7 @@ class SlamMap:
                 continue
             for ids in (keyframe.point_ids, keyframe.refined_for):
                 ids[dead[ids]] = -1
-        self._free_ids = sorted(self._free_ids + self._quarantined_ids, reverse=True)
+        self._free_ids = sorted(self._free_ids + self._quarantined_ids)
         self._quarantined_ids = np.flatnonzero(~known).tolist()
 
     def append_points(self, other: SlamMap, own_from_other: Similarity) -> int:
@@ -333,13 +335,13 @@ class SlamMap:
         Only candidates that are frequent among the latest observers of the points are counted.
         """
         points = points[self.alive[points]]
-        mask = np.zeros(self.n_points + 1, bool)
-        mask[points] = True
+        self._marked[points] = True
         observations_of = self.observers[points].ravel()
         keys, often = np.unique(observations_of[observations_of >= 0], return_counts=True)
         order = np.lexsort((keys, -often))[:MAX_COVISIBLE_CANDIDATES]
         near = [self.keyframes[k] for k in keys[order].tolist() if k in self.keyframes]
-        counts = [(int(np.count_nonzero(mask[k.point_ids])), k.keyframe_id) for k in near]
+        counts = [(int(np.count_nonzero(self._marked[k.point_ids])), k.keyframe_id) for k in near]
+        self._marked[points] = False
         return sorted((c for c in counts if c[0] >= minimum), key=lambda c: (-c[0], c[1]))
 
     def pose_of(self, keyframe_id: int) -> Pose | None:
