@@ -57,8 +57,7 @@ class Atlas:
         self._background = background
         self._features, self._camera, self._map_lock = features, camera, map_lock
         self._relocalizer = Relocalizer(camera)
-        self._database = KeyframeDatabase()
-        self._finder = LoopDetector(self._database, self._relocalizer)
+        self.free_index()
         self._cooldown = 0
         self._pending: SlamMap | None = None
         self.site: SlamMap | None = None
@@ -96,6 +95,11 @@ class Atlas:
             self.segments.pop()
         fresh = SlamMap(self._features.scale_factor, self._features.n_levels, level=level)
         self.segments.append(fresh)
+
+    def free_index(self) -> None:
+        """Begin the index of places anew, or free it where no keyframe comes any more."""
+        self._database = KeyframeDatabase()
+        self._finder = LoopDetector(self._database, self._relocalizer)
 
     def resume(self, kept: SlamMap) -> None:
         """Activate a stored map and index its keyframes; no other may have been initialised.

@@ -196,6 +196,7 @@ class Tracker:
         self._ahead.close()
         self.map_lock.end_order()
         self._worker.close()
+        self.atlas.free_index()
         return self._worker.done()
 
     def _track_frame(self, frame: Frame, features: Features, prior: Prior) -> list[TrackerOutput]:
