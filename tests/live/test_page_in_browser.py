@@ -20,7 +20,8 @@ pytestmark = [
     pytest.mark.skipif(not CHROMIUM.exists(), reason="there is no Chromium: apt install chromium"),
 ]
 PHONE = 390
-VIEWS = ("/", "/map", "/flights", "/setup", "/settings", "/settings?expert=1", "/pair")
+STEPS = ("/setup", "/setup/lens", "/setup/mount")
+VIEWS = ("/", "/map", "/flights", *STEPS, "/settings", "/settings?expert=1", "/pair")
 SENT = re.compile(r"poses a second go to the autopilot")
 
 

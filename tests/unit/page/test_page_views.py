@@ -166,7 +166,8 @@ def test_flights_are_kept_and_deleted(served: ServedPage) -> None:
 
 
 def test_every_view_is_one_that_a_screen_reader_can_walk_through(served: ServedPage) -> None:
-    for path in ("/", "/map", "/flights", f"/flights/{NAME}", "/setup", "/settings", "/pair"):
+    steps = ("/setup", "/setup/lens", "/setup/mount")
+    for path in ("/", "/map", "/flights", f"/flights/{NAME}", *steps, "/settings", "/pair"):
         text = here(served, path).text
         for wanted in ('lang="en"', "<main", "<nav aria-label", "<h1", 'class="skip"'):
             assert wanted in text, (path, wanted)
