@@ -154,6 +154,10 @@ class InertialAlignment:
             int(np.count_nonzero(used)),
         )
         self._prior, self._prior_mean = _prior(start)
+        # places and velocities that nothing is known of, at first and after gaps: determinants
+        # count them as noise, but no square of the regressors has any of it
+        n_parts = 2 * (1 + np.count_nonzero(~known)) - (start is not None)
+        self._n_unknown = 3 * int(n_parts)
 
     @property
     def sustained_m_s2(self) -> float:
@@ -180,7 +184,7 @@ class InertialAlignment:
         left[1, 1] += found.squares
         squared = float(np.array([scale, 1.0]) @ left @ np.array([scale, 1.0]))
         wider = self._equations(scale * np.exp(STEP), sigma_map)
-        by_noise = 0.5 * (found.log_determinant - wider.log_determinant) / STEP
+        by_noise = 0.5 * (found.log_determinant - wider.log_determinant) / STEP - self._n_unknown
         signal = float(left[1, 1]) - by_noise
         if signal <= 0.0 or left[0, 1] >= 0.0:
             return None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -37,9 +39,10 @@ class Flight:
     """Tracked frames, and what an imperfect IMU measured along a path."""
 
     def __init__(
-        self, path: Path, seed: int = 0, axes: Array | None = None, seconds: float = SECONDS
-    ) -> None:
-        rng = np.random.default_rng(seed)
+        self, path: Path, seed: int = 0, axes: Array | None = None, seconds: float = SECONDS,
+        rng: Any = None,
+    ) -> None:  # fmt: skip
+        rng = rng or np.random.default_rng(seed)
         self.integral = AccelerationIntegral()
         motion = MeasuredMotion(path, rng, seconds + 1.0, axes)
         self.bias_m_s2, self.tilt = motion.bias_m_s2, motion.tilt
@@ -50,7 +53,9 @@ class Flight:
         where = np.array([path(each) for each in t_s]) + turns @ LEVER_M
         noise = rng.normal(scale=4e-4, size=where.shape)
         way = np.linalg.norm(np.diff(where, axis=0, prepend=where[:1]), axis=1) / METRES_PER_UNIT
-        noise += np.cumsum(rng.normal(size=where.shape) * 1e-3 * np.sqrt(way)[:, None], axis=0)
+        noise = noise + np.cumsum(
+            rng.normal(size=where.shape) * 1e-3 * np.sqrt(way)[:, None], axis=0
+        )
         self.places = Places(
             np.round(t_s * 1e9).astype(np.int64), MAP_FROM_NED @ turns,
             where @ MAP_FROM_NED.T / METRES_PER_UNIT + noise, motion.tilt @ turns,
@@ -85,6 +90,27 @@ def test_while_it_flies_it_is_never_far_from_what_it_states() -> None:
     off = np.array([np.log(each.scale / METRES_PER_UNIT) / each.sigma for each in said])
     assert np.abs(off).max() < 3.5
     assert said[-1].sigma < 0.03
+
+
+class Exact:
+    """Source of noise that gives none."""
+
+    def normal(self, loc: float = 0.0, scale: float = 1.0, size: Any = ()) -> Array:
+        return np.zeros(size)
+
+
+def swaying(t_s: float) -> Array:
+    """Barely: 0.2 m/s2."""
+    return np.array([3.0 * t_s, 0.6 * np.sin(0.6 * t_s), -20.0 + 0.3 * np.sin(0.4 * t_s)])
+
+
+def test_what_is_not_known_at_first_does_not_make_a_map_small() -> None:
+    """Its place and velocity: they are no noise of what accelerometers measured, here exactly."""
+    flight = Flight(swaying, rng=Exact(), seconds=12.0)
+    found = flight.live()[7:]  # from four seconds on
+    off = [each and np.log(each.scale / METRES_PER_UNIT) / each.sigma for each in found]
+    print(np.round(off, 2))
+    assert all(each is not None and abs(each) < 0.8 for each in off)
 
 
 @pytest.mark.parametrize("path", [straight, hovering])
