@@ -109,7 +109,6 @@ def test_what_is_not_known_at_first_does_not_make_a_map_small() -> None:
     flight = Flight(swaying, rng=Exact(), seconds=12.0)
     found = flight.live()[7:]  # from four seconds on
     off = [each and np.log(each.scale / METRES_PER_UNIT) / each.sigma for each in found]
-    print(np.round(off, 2))
     assert all(each is not None and abs(each) < 0.8 for each in off)
 
 
