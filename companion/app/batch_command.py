@@ -29,6 +29,8 @@ from companion.products.atomic_file import write_atomically
 from companion.products.report.batch_page import BatchResult, MergedMap, batch_page
 
 DONE, INDEX, REPORT, THUMBNAIL = "batch.json", "index.html", "report.json", "thumbnail.jpg"
+CONNECT = "10s"
+"""Longest wait for a scheduler that is asked for."""
 MOST_FILES = 1000
 """Files of a flight's folder checked for changes; a flight of images has its list besides."""
 
@@ -105,7 +107,7 @@ def _cluster(scheduler: str | None, n_wanted: int) -> Iterator[Any]:
     dask: Any = distributed  # whose calls carry no types
     if scheduler is not None:
         try:
-            client = dask.Client(scheduler, timeout="10s")
+            client = dask.Client(scheduler, timeout=CONNECT)
         except (OSError, ValueError, TimeoutError) as error:
             raise InputError(f"{scheduler}: there is no Dask scheduler: {error}") from error
         with client:

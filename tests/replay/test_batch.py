@@ -16,6 +16,15 @@ pytest.importorskip("distributed")
 FIRST, SECOND = "2026-01-01T00-00-00Z", "2026-01-02T00-00-00Z"
 
 
+IMPATIENT = """
+import sys
+from companion.app import batch_command
+from companion.app.cli import main
+batch_command.CONNECT = "0.5s"
+sys.exit(main(sys.argv[1:]))
+"""
+
+
 def batch(*words: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "companion", "batch", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
@@ -70,6 +79,8 @@ def test_an_archive_is_replayed_once_and_shown_on_one_page(tmp_path: Path) -> No
 
 def test_a_cluster_that_is_not_there_is_named(tmp_path: Path) -> None:
     record(tmp_path / FIRST, 3)
-    done = batch(tmp_path / FIRST, "--out", tmp_path / "out", "--scheduler", "tcp://127.0.0.1:1")
+    words = [tmp_path / FIRST, "--out", tmp_path / "out", "--scheduler", "tcp://127.0.0.1:1"]
+    command = [sys.executable, "-c", IMPATIENT, "batch", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
     assert done.returncode == 2
     assert "tcp://127.0.0.1:1: there is no Dask scheduler" in done.stderr

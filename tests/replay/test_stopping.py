@@ -17,17 +17,20 @@ import pytest
 from tests.support.reference.scoring import read_ply, read_tum
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
+COMMAND = [sys.executable, "-m", "companion", "replay", str(SAMPLE)]
 N_FRAMES, N_TRACKED = 466, 20
 PATIENCE_S = 120.0
 """For a program to begin, or to write its results, on a machine that has much else to do."""
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_results_so_far(tmp_path: Path, number: signal.Signals, status: int) -> None:
+@pytest.mark.parametrize(
+    ("number", "status", "dense"), [(signal.SIGINT, 130, "true"), (signal.SIGTERM, 143, "false")]
+)
+def test_results_so_far(tmp_path: Path, number: signal.Signals, status: int, dense: str) -> None:
     """Progress goes to a terminal of our own, which tells when the camera is tracked."""
     ours, theirs = os.openpty()
     process = subprocess.Popen(
-        [sys.executable, "-m", "companion", "replay", SAMPLE, "--out", tmp_path / "out"],
+        [*COMMAND, "--out", str(tmp_path / "out"), "--set", f"depth.enabled={dense}"],
         stderr=theirs,
         stdout=subprocess.DEVNULL,
         env={**os.environ, "TERM": "xterm", "COLUMNS": "120"},

@@ -206,7 +206,7 @@ def test_a_mission_is_fetched_over_a_link_that_loses_a_third(
     assert (count.target_system, count.target_component) == GROUND
     assert count.count == len(given)
     ours.waypoints = np.zeros((5, 3))
-    for n, (latitude, longitude, height) in enumerate(given[:40]):
+    for n, (latitude, longitude, height) in enumerate(given[:20]):
         request = mavlink.MAVLink_mission_request_int_message(*OURS, n)
         if n % 2:  # of old ground stations
             request = mavlink.MAVLink_mission_request_message(*OURS, n)
