@@ -63,6 +63,7 @@ GIMBAL_MISMATCH = PilotMessage(WARNING, "gimbal mismatch: no vision position")
 GIMBAL_SILENT = PilotMessage(WARNING, "gimbal silent: no vision position")
 GIMBAL_USED = PilotMessage(INFO, "gimbal angles used again")
 MAP_TILTED = PilotMessage(WARNING, "map tilted: restarting")
+PICTURE_STANDS = PilotMessage(WARNING, "camera picture stands: restarting")
 MAP_RESUMED = PilotMessage(NOTICE, "map resumed after restart")
 MAP_NOT_RESUMED = PilotMessage(NOTICE, "old map not recognised: new map")
 MAP_NOT_SAVED = PilotMessage(NOTICE, "map not saved for a restart")
@@ -226,6 +227,7 @@ OF_WARNING: Mapping[str, PilotMessage] = {
     "the gimbal's angles fit the camera again": GIMBAL_USED,
     "the gimbal's angles are known again": GIMBAL_USED,
     "map tilted against the autopilot's attitude: begun anew": MAP_TILTED,
+    "the picture stands while the vehicle moves: map begun anew": PICTURE_STANDS,
     "map resumed after restart": MAP_RESUMED,
     "old map not recognised: new map": MAP_NOT_RESUMED,
     "the map cannot be kept for a restart in flight": MAP_NOT_SAVED,

@@ -1,4 +1,4 @@
-"""Checks of the autopilot's attitude in flight, and what follows from one that fails."""
+"""Checks of maps by the autopilot's attitude and IMU in flight, and what follows if one fails."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from companion.geometry.transforms import Array
 from companion.messages import Warned
 from companion.slam.tracking.tracker import Tracker
 
+SIGHT_STANDS = "the picture stands while the vehicle moves: map begun anew"
+MAX_STANDS_NS = 700_000_000
+"""Shorter than what the filter of the body refuses until it believes the map: a second."""
 NO_CLIMB = "at lift-off it sees another motion than the accelerometers measure; check mount.*"
 
 
@@ -25,7 +28,11 @@ class AttitudeChecks:
         self._georeferences, self._odometry = georeferences, odometry
 
     def check(self, t_ns: int) -> list[Warned]:
-        """Check it in the active map, where that is due."""
+        """Check the active map, by the attitude where that is due."""
+        stands_ns = self._odometry.stands_since_ns
+        if stands_ns is not None and t_ns - stands_ns > MAX_STANDS_NS:
+            self._leave_map(1, True, 0.0)
+            return [Warned(t_ns, SIGHT_STANDS, "by the accelerometers; is the lens covered?")]
         if not self._attitude.due(t_ns):
             return []
         segment = self._tracker.map
@@ -46,7 +53,6 @@ class AttitudeChecks:
         return self._apply(self._attitude.contradicted(t_ns, NO_CLIMB))
 
     def _apply(self, checked: AttitudeCheck) -> list[Warned]:
-        segment = self._tracker.map
         if checked.now_from_before is not None:
             correct_mount(self._tracker.segments, checked.now_from_before)
         if checked.before_from_now_ned is not None:
@@ -55,8 +61,12 @@ class AttitudeChecks:
             self._motion.discard_alignment()
             clear_since(self._tracker.segments, checked.invalid_since_ns)
         if checked.reinitialise:
-            self._tracker.reinitialise(checked.n_reinitialised, keep=not checked.young)
-            self._motion.reset()
-            self._attitude.reset()
-            self._odometry.discard_map(segment.first_keyframe_id, checked.tilt_rad)
+            self._leave_map(checked.n_reinitialised, not checked.young, checked.tilt_rad)
         return checked.warnings
+
+    def _leave_map(self, number: int, keep: bool, tilt_rad: float) -> None:
+        segment = self._tracker.map
+        self._tracker.reinitialise(number, keep)
+        self._motion.reset()
+        self._attitude.reset()
+        self._odometry.discard_map(segment.first_keyframe_id, tilt_rad)

@@ -296,7 +296,10 @@ class LocalisationStage:
         update = self._map_update() if other_map and self._segments() else None
         seen: Pose | None = None
         for message in tracked:
-            if isinstance(message, Track) and message.map_from_camera is not None:
+            if isinstance(message, Track) and self._smooth.stands_since_ns is not None:
+                yield self._odometry.of_track(message)
+                yield Track(message.seq, message.t_ns, TrackState.LOST)
+            elif isinstance(message, Track) and message.map_from_camera is not None:
                 measured = self._attitude.at(message.t_ns)
                 if message.seq == frame.seq or measured is not None:
                     # angular rates are held without attitude; those of backfilled frames are rough

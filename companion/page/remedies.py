@@ -31,6 +31,8 @@ OF_WARNING: Mapping[str, str] = {
     "the gimbal's angles are known again": NOTHING,
     "map tilted against the autopilot's attitude: begun anew":
         "Once after take-off: nothing to do. Again and again: the mount is stated wrong.",
+    "the picture stands while the vehicle moves: map begun anew":
+        "Land by other means; look for a cover, dirt on the lens, or a camera that is frozen.",
     "map resumed after restart": NOTHING,
     "located in the map of an earlier flight": NOTHING,
     "the map of an earlier flight is not used":

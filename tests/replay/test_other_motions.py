@@ -7,7 +7,7 @@ import pytest
 
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, rotation_from_vector, yaw_rotation
-from tests.support.flights.rendered_flight import CAMERA_DOWN, Terrain, fly
+from tests.support.flights.rendered_flight import CAMERA_DOWN, Terrain, fly, white_between
 
 CAMERA = Camera(320, 240, 260.0, 258.0, 161.0, 118.0, body_from_camera=CAMERA_DOWN)
 BOTH = pytest.mark.parametrize("plane", [False, True], ids=["over roofs", "over flat ground"])
@@ -79,7 +79,7 @@ def going_north(after_s: float) -> Pose:
 
 
 def test_where_sight_returns_over_a_place_never_seen_the_map_goes_on_in_the_same_frame() -> None:
-    flown = fly(CAMERA, going_north, Terrain(3), 8.5, 8.0, dropout_s=(3.5, 6.5))
+    flown = fly(CAMERA, going_north, Terrain(3), 8.5, 8.0, seen=white_between(3.5, 6.5))
     assert flown.stage.n_segments == 2
     due = [t_ns for t_ns in flown.frames_ns if not 3.5 <= (t_ns - flown.frames_ns[0]) * 1e-9 < 6.5]
     placed = {pose.t_ns for pose in flown.result.poses()}
@@ -99,7 +99,7 @@ def agile(after_s: float) -> Pose:
 
 
 def test_an_agile_flight_relocalises_within_a_second_after_an_image_dropout() -> None:
-    flown = fly(CAMERA, agile, Terrain(3), 10.0, 15.0, dropout_s=(5.0, 7.0))
+    flown = fly(CAMERA, agile, Terrain(3), 10.0, 15.0, seen=white_between(5.0, 7.0))
     after_s = [(t_ns - flown.frames_ns[0]) * 1e-9 for t_ns in flown.frames_ns]
     known_s = {
         round((t.t_ns - flown.frames_ns[0]) * 1e-9, 6)

@@ -91,6 +91,7 @@ class BodyFilter:
         self._taken: deque[tuple[BodyState, Aiding]] = deque()
         """The latest measurements, and the state before each."""
         self._refused_since_ns: int | None = None
+        self._newest_place_ns = 0
         self._shaken_since_ns: int | None = None
         self._normalised = 1.0
         """Mean squared innovation per degree of freedom, of the latest places."""
@@ -111,6 +112,11 @@ class BodyFilter:
         seen = np.zeros(N_STATE)
         seen[GROUND], seen[DOWN] = 1.0, -1.0
         return float(seen @ self._state.mean), float(np.sqrt(seen @ self._state.covariance @ seen))
+
+    @property
+    def refuses(self) -> bool:
+        """True where the innovation gate has refused the newest place, and the one before."""
+        return self._refused_since_ns not in (None, self._newest_place_ns)
 
     @property
     def n_refused(self) -> dict[str, int]:
@@ -281,6 +287,7 @@ class BodyFilter:
         """Begin anew with a place, where places have been refused for too long."""
         since_ns = self._refused_since_ns if self._refused_since_ns is not None else place.t_ns
         self._refused_since_ns = since_ns if refused else None
+        self._newest_place_ns = place.t_ns
         if refused and place.t_ns - since_ns > MAX_REFUSED_NS:
             self._begin(place)
 

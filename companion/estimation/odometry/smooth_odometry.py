@@ -32,6 +32,9 @@ QUALITY_MARGIN = 1.5
 vehicle that turns on the spot sees new ground without parallax."""
 SIGMA_DOUBTED_M, SIGMA_DOUBTED_M_S = 0.1, 0.1
 """At least, of inertial navigation that a wrong map has aided."""
+LEAST_GONE_M, STANDS_RATIO = 0.25, 0.3
+"""Way by inertial navigation since the map agreed with it, and of that what the map has of it at
+most where it stands."""
 NOISE_INFLATION = 3.0
 """Inflation for correlated errors of the matches of one image: those of the points they share."""
 
@@ -59,6 +62,10 @@ class SmoothOdometry:
         self._stand = Stand(self._course, self.ground)
         self._starts = MapStarts(self._course, self._stand)
         self._heading = LiftOffHeading()
+        self._agreed_m: Array = np.zeros(3)
+        """Place (3,) at which the map and inertial navigation agreed last."""
+        self.stands_since_ns: int | None = None
+        """Time since which the map stands and accelerometers say that it moves; else None."""
 
     def begin(
         self, t_ns: int, attitude: BodyAttitude | None, standing: bool = False,
@@ -148,10 +155,16 @@ class SmoothOdometry:
         quality = quality_of(track, self._size)
         if quality < self._least_quality and self.reckoning.is_good:
             return course.reckoned(track)
+        attitude = self.reckoning.attitude
+        image_m = track.sigma_position * georeference.world_from_map.scale
+        noise_m = NOISE_INFLATION * image_m
+        if self._stands(track.t_ns, flown.frame.from_world @ raw):
+            self._aid(track.t_ns, flown.frame.from_world @ raw, georeference, noise_m)
+            return course.none(Track(track.seq, track.t_ns, TrackState.LOST))
         if course.dead_reckoning:
             self._starts.reacquire(raw, track.t_ns)
         frame, last = flown.frame, flown.last
-        here, attitude = frame.from_world @ raw, self.reckoning.attitude
+        here = frame.from_world @ raw
         if last is not None:
             dt_s = min((track.t_ns - last.t_ns) * 1e-9, 1.0)
             span_s = 0.0 if first is None else (track.t_ns - first.t_ns) * 1e-9
@@ -176,12 +189,7 @@ class SmoothOdometry:
         course.body.move(
             placed.rotation @ here.rotation.T, here.translation, placed.translation, 1.0
         )
-        image_m = track.sigma_position * georeference.world_from_map.scale
-        noise_m = NOISE_INFLATION * image_m
-        if attitude is not None and georeference.sigma_scale < MAX_SIGMA_SCALE_AIDING:
-            turned = placed.rotation @ attitude.ned_from_body.T
-            course.body.aid(AidedPlace(attitude.t_ns, placed.translation, turned, noise_m))
-            self.ground.map_aided(track.t_ns)
+        self._aid(track.t_ns, placed, georeference, noise_m)
         to_world = georeference.world_from_map
         found = tracked_velocity(
             None if attitude is None else course.body.moving(attitude.t_ns), velocity_map,
@@ -202,6 +210,30 @@ class SmoothOdometry:
             course.sigma_yaw_rad(georeference, noise_rad),
             sigma_scale=georeference.sigma_scale, sigma_by_scale_m=drift.by_scale_m,
         )  # fmt: skip
+
+    def _aid(self, t_ns: int, placed: Pose, georeference: Georeference, noise_m: float) -> None:
+        """Aid inertial navigation by a tracked pose of the body, where the map's scale is good."""
+        attitude = self.reckoning.attitude
+        if attitude is not None and georeference.sigma_scale < MAX_SIGMA_SCALE_AIDING:
+            turned = placed.rotation @ attitude.ned_from_body.T
+            self._course.body.aid(AidedPlace(attitude.t_ns, placed.translation, turned, noise_m))
+            self.ground.map_aided(t_ns)
+
+    def _stands(self, t_ns: int, placed: Pose) -> bool:
+        """True where a tracked pose of the body stands, and accelerometers say that it has gone on.
+
+        A pattern that stands in the picture, dirt or the sensor's own, is tracked as well as ground
+        is.
+        """
+        reckoned, place_m = self.reckoning.reckoned, placed.translation
+        if not self._course.body.refuses:
+            self._agreed_m, self.stands_since_ns = place_m, None
+        elif self.stands_since_ns is None and reckoned is not None:
+            seen_m = float(np.linalg.norm(place_m - self._agreed_m))
+            gone_m = float(np.linalg.norm(reckoned.place_m - self._agreed_m))
+            if gone_m > LEAST_GONE_M and seen_m < STANDS_RATIO * gone_m:
+                self.stands_since_ns = t_ns
+        return self.stands_since_ns is not None
 
     def place_in_map(self, place_m: Array, map_from_camera: Array) -> Array | None:
         """Place of the camera (3,) in the active map; see `FlownMap.place_of_camera`."""
@@ -226,11 +258,13 @@ class SmoothOdometry:
         self.reckoning.clear()
 
     def discard_map(self, segment: int, tilt_rad: float) -> None:
-        """Handle a map that was found tilted: what aided inertial navigation was tilted, too.
+        """Handle a map that was found wrong: what aided inertial navigation was, too.
 
-        It is doubted by as much as that has turned the way since the map began, and the velocity.
+        It is doubted by as much as the tilt has turned the way since the map began, and the
+        velocity.
         """
         flown, velocity = self._course.flown, self._course.velocity
+        self.stands_since_ns = None
         if flown.placed is None or segment != flown.placed.segment or flown.last is None:
             return
         share, way_m = float(np.sin(min(tilt_rad, np.pi / 2))), flown.way_m()

@@ -56,6 +56,16 @@ PathOf = Callable[[float], Pose]
 """`ned_from_body` by seconds since the start."""
 
 
+def as_it_is(after_s: float, grey: Bytes) -> Bytes:
+    """The picture (H, W) of a camera without a fault."""
+    return grey
+
+
+def white_between(start_s: float, stop_s: float) -> Callable[[float, Bytes], Bytes]:
+    """A camera that sees nothing for some time."""
+    return lambda after_s, grey: np.full_like(grey, 252) if start_s <= after_s < stop_s else grey
+
+
 class Terrain:
     """Flat ground, and flat roofs over it unless it is to be `plane`; z is down.
 
@@ -175,7 +185,7 @@ class Flown:
 
 def fly(
     camera: Camera, ned_from_body: PathOf, terrain: Terrain, seconds: float, rate_hz: float,
-    *, told: bool = True, dropout_s: tuple[float, float] = (0.0, 0.0), exposure_s: float = 0.0,
+    *, told: bool = True, seen: Callable[[float, Bytes], Bytes] = as_it_is, exposure_s: float = 0.0,
     imu_seed: int | None = None, settings: Sequence[str] = (), site: SiteMap | None = None,
     ned_from_head: PathOf | None = None, beside: Sequence[Telemetry] = (),
 ) -> Flown:  # fmt: skip
@@ -183,7 +193,7 @@ def fly(
 
     With `site` it is flown in the map of an earlier flight.
 
-    From the first to the second time of `dropout_s` the picture is white. Frames are stamped in the
+    What comes of a picture is `seen`, by seconds since the start. Frames are stamped in the
     middle of an exposure, in which what moves blurs. With `imu_seed` there is a noisy IMU, too. A
     camera on a gimbal is carried by `ned_from_head`; what that says of itself comes `beside` the
     telemetry.
@@ -216,9 +226,7 @@ def fly(
 
     def pictures() -> Iterator[Frame]:
         for seq, (t_ns, _) in enumerate(poses):
-            dropped_out = _ns(dropout_s[0]) <= t_ns < _ns(dropout_s[1])
-            grey = picture(seq)
-            grey = np.full_like(grey, 252) if dropped_out else grey
+            grey = seen(seq / rate_hz, picture(seq))
             yield Frame(seq, t_ns, grey, np.repeat(grey[..., None], 3, 2))
 
     samples = list(telemetry_of(ned_from_body, seconds)) if told else []
