@@ -44,7 +44,7 @@ from tests.support.flights.noisy_telemetry import with_noise
 WINDOW_NS = 10_000_000_000
 BOUNDS = {1: 3.841, 2: 5.991, 3: 7.815}
 """Chi-square that is exceeded once in twenty times, by degrees of freedom."""
-FREEDOM = {"heading": 1, "NIS flow": 2, "NIS height": 1}
+FREEDOM = {"heading": 1, "NIS height": 1}
 """Degrees of freedom where there are not three."""
 DENIED = 'telemetry.use=["attitude","imu"]'
 KINDS = (

@@ -16,6 +16,9 @@ RELIEF = 0.3
 come into sight and go."""
 SIGMA_BAROMETER_M = 0.5
 """Of a height, with the gusts that press on the sensor."""
+CLIMB_HEIGHT_M = 2.0
+"""Height over the ground from which flow tells the climb, too: at a lift-off velocity and height
+are small and grow alike."""
 LEAST_SIGMA_PLACE_M, LEAST_SIGMA_FLOW_M_S = 0.005, 0.02
 SIGMA_RANGE_M, SIGMA_RANGE_RATIO = 0.1, 0.03
 """Of a rangefinder, which sits elsewhere on the body than the camera, over grass and stones."""
@@ -132,22 +135,22 @@ def _range_model(measured: AidedRange, state: BodyState) -> Model | None:
 
 
 def _flow_model(flow: AidedFlow, state: BodyState) -> Model | None:
-    """The level part of flow.
+    """Flow: its level part, and high enough its vertical one.
 
     Velocity is flow times height, which is of the state: the difference is linear in it. But
     heights are considered only (Schmidt 1966), not corrected: flow is a regressor, and its noise
-    would make them small. The vertical part would tell little for the same reason: at a lift-off
-    velocity and height are small and grow alike.
+    would make them small.
     """
     height_m = state.mean[GROUND] - state.mean[DOWN]
     if not state.covariance[GROUND, GROUND] > 0.0 or height_m <= 0.0:
         return None
-    level = state.world_from_attitude[:2]
-    seen = np.zeros((2, N_STATE))
-    seen[:, VELOCITY] = np.eye(2, 3)
-    seen[:, DOWN] = level @ flow.velocity_hz
+    n = 3 if height_m > CLIMB_HEIGHT_M else 2
+    turn = state.world_from_attitude[:n]
+    seen = np.zeros((n, N_STATE))
+    seen[:, VELOCITY] = np.eye(n, 3)
+    seen[:, DOWN] = turn @ flow.velocity_hz
     seen[:, GROUND] = -seen[:, DOWN]
     along = RELIEF * seen[:, DOWN : DOWN + 1]
-    variance = height_m**2 * (level @ flow.covariance_hz2 @ level.T + along @ along.T)
-    variance += LEAST_SIGMA_FLOW_M_S**2 * np.eye(2)
-    return Model(Aid.FLOW, seen, np.zeros(2), variance, considered=(DOWN, GROUND))
+    variance = height_m**2 * (turn @ flow.covariance_hz2 @ turn.T + along @ along.T)
+    variance += LEAST_SIGMA_FLOW_M_S**2 * np.eye(n)
+    return Model(Aid.FLOW, seen, np.zeros(n), variance, considered=(DOWN, GROUND))

@@ -236,6 +236,29 @@ def test_flow_over_the_ground_bounds_the_drift() -> None:
     assert not flown.navigation.knows_ground
 
 
+@pytest.mark.parametrize(("height_m", "bounds"), [(3.0, True), (1.5, False)])
+def test_flow_tells_the_climb_where_the_ground_is_not_near(height_m: float, bounds: bool) -> None:
+    """Twenty seconds without a place, over ground that is so far below on average."""
+    rng, sigma_hz, ground_down_m = np.random.default_rng(4), 0.02, -20.0 + height_m
+    downs_m = []
+    for seed in range(3):
+        flown, unaided = (Flown(gently, seed, 20.0) for _ in range(2))
+        flown.navigation.lift_off(ground_down_m, 0.15)
+        for t_s in np.arange(AIDED_S + 0.2, AIDED_S + 19.8, 0.2):
+            flow_hz = velocity(gently, t_s) / (ground_down_m - gently(t_s)[2])
+            flow_hz = flow_hz + rng.normal(scale=sigma_hz, size=3)
+            measured = AidedFlow(round(t_s * 1e9), flow_hz, sigma_hz**2 * np.eye(3))
+            flown.navigation.aid(measured)
+        downs_m.append([each.error(AIDED_S + 19.9)[0][2] for each in (flown, unaided)])
+    aided_m, unaided_m = np.abs(downs_m).mean(0)
+    assert bounds is bool(aided_m < 0.5 * unaided_m)
+
+
+def gently(t_s: float) -> Array:
+    """Place in NED, metres: 1 m to either side and 0.2 m up and down."""
+    return np.array([0.5 * t_s, np.sin(0.9 * t_s), -20.0 + 0.2 * np.sin(0.6 * t_s)])
+
+
 def test_flow_does_not_move_the_height() -> None:
     """Over roofs it is twice as fast as over the ground that is known."""
     flown, unaided = (Flown(weaving, 3, 4.0) for _ in range(2))
