@@ -134,7 +134,9 @@ class InOrder:
         """Pass on what depth has made since; `feed` does so itself."""
         if self._depth is not None:
             fault = self._depth.fault  # which comes after the last that it has given
-            self._publish(self._depth.collect())
+            while not self._depth.given.empty():
+                given = self._depth.given.get()
+                self._pass(given.open() if isinstance(given, Parcel) else given)
             self._warn(fault)
 
     def finish(self, finish: Callable[[Stage], Finish]) -> None:
@@ -147,8 +149,8 @@ class InOrder:
         finally:  # results so far are written, whatever has failed
             # before the final map comes: what it is measured by is that of its own time
             if self._depth is not None:
-                self._publish(self._depth.close(Finish(hurry=False)))
-                self._warn(self._depth.fault)
+                self._depth.close(Finish(hurry=False))
+                self.collect()
             self._publish(last)
             try:
                 for stage in self._stages:

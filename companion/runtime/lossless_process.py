@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import queue
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable
 
 from companion.errors import StageError
 from companion.runtime.parcel import Parcel
@@ -17,14 +16,14 @@ from companion.runtime.stages import Stage
 class LosslessProcess:
     """A stage that takes all messages in order, and gives what it would give here; as StageThread.
 
-    What it gives waits until it is collected. A stage that raises ends: later messages are ignored,
-    earlier results can still be collected, and `fault` is the exception.
+    What it has given waits in `given`, closed. A stage that raises ends: later messages are
+    ignored, and `fault` is the exception.
     """
 
     def __init__(self, stage: Stage, start: Start, say: Callable[[str], None]) -> None:
-        self._given: queue.SimpleQueue[Parcel] = queue.SimpleQueue()
+        self.given: queue.SimpleQueue[Parcel] = queue.SimpleQueue()
         self._process = StageProcess(
-            stage, start, self._given.put, lambda why: None, say, waits=True
+            stage, start, self.given.put, lambda why: None, say, waits=True
         )
 
     def begin(self, setup: Setup) -> None:
@@ -53,20 +52,11 @@ class LosslessProcess:
         """Pass a message; waits for room."""
         self._process.offer(parcel)
 
-    def collect(self) -> Iterator[Any]:
-        """Results so far."""
-        while True:
-            try:
-                yield self._given.get_nowait().open()
-            except queue.Empty:
-                return
-
-    def close(self, finish: Finish) -> list[Any]:
-        """Finish; the last results."""
+    def close(self, finish: Finish) -> None:
+        """Finish; the last results are given then."""
         self._process.ask_to_finish(finish)
         self._process.wait()
         self.kill()
-        return list(self.collect())
 
     def kill(self) -> None:
         """End it now."""

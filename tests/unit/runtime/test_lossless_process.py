@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -41,6 +42,11 @@ def tiny(monkeypatch: pytest.MonkeyPatch, remarks: list[str]) -> Iterator[Lossle
     made.kill()
 
 
+def given_at_last(tiny: LosslessProcess) -> list[Any]:
+    tiny.close(NOT_HURRIED)
+    return [tiny.given.get().open() for _ in range(tiny.given.qsize())]
+
+
 def do(tiny: LosslessProcess, what: str, detail: str = "") -> None:
     tiny.put(Parcel.of(Do(1, what, detail)))
 
@@ -60,7 +66,7 @@ def test_all_come_in_order_and_all_is_given(tiny: LosslessProcess, remarks: list
         else:
             tiny.put(frame(n))
         sent.append(str(n))
-    given = [*tiny.collect(), *tiny.close(NOT_HURRIED)]
+    given = given_at_last(tiny)
     assert [each.text for each in given] == [*sent, "at leisure"]
     assert tiny.fault is None
     assert remarks == ["it is up"]
@@ -74,7 +80,7 @@ def test_it_may_give_more_than_is_taken(tiny: LosslessProcess) -> None:
     for _ in range(50):
         tiny.put(frame(1))
         do(tiny, "say much", "x")
-    assert sum(isinstance(each, Said) for each in tiny.close(NOT_HURRIED)) == 50 * 31 + 1
+    assert sum(isinstance(each, Said) for each in given_at_last(tiny)) == 50 * 31 + 1
 
 
 def test_whoever_feeds_waits_for_room(tiny: LosslessProcess) -> None:
@@ -100,7 +106,7 @@ def test_whoever_feeds_waits_for_room(tiny: LosslessProcess) -> None:
     assert n_put <= room + 4
     stopped.resume()
     feeder.join(30)
-    given = tiny.close(NOT_HURRIED)
+    given = given_at_last(tiny)
     assert [each.text for each in given] == [*map(str, range(3 * room)), "at leisure"]
 
 
@@ -112,7 +118,7 @@ def test_what_it_raises_is_raised_here_after_what_was_given_before(
     do(tiny, "say", "before")
     do(tiny, "raise", which)
     do(tiny, "say", "after")
-    last = tiny.close(NOT_HURRIED)
+    last = given_at_last(tiny)
     assert [each.text for each in last] == ["before"]
     error, fault = ERRORS[which], tiny.fault
     is_told = which == "not pickled"
@@ -130,6 +136,6 @@ def test_one_that_cannot_begin_raises_as_it_begins(tiny: LosslessProcess) -> Non
 def test_a_driver_that_crashes_ends_the_process_alone(tiny: LosslessProcess) -> None:
     tiny.begin(SETUP)
     do(tiny, "crash")
-    assert tiny.close(NOT_HURRIED) == []
+    assert given_at_last(tiny) == []
     assert isinstance(tiny.fault, StageError)
     assert str(tiny.fault) == "the process of source: killed by SIGSEGV"
