@@ -18,7 +18,7 @@ from companion.errors import CompanionError
 from companion.messages import Frame, Message, Warned
 from companion.runtime.fork_server import ForkServer
 from companion.runtime.lossless_process import LosslessProcess
-from companion.runtime.parcel import Parcel
+from companion.runtime.parcel import Parcel, allow_descriptors
 from companion.runtime.peak_memory import peak_memory_mb
 from companion.runtime.stage_protocol import Finish, Progress, Remark, Setup
 from companion.runtime.stage_thread import StageThread
@@ -57,6 +57,7 @@ class InOrder:
                 say(told.text)
 
         if apart and len(os.listdir("/proc/self/task")) == 1:  # else a copy would not be whole
+            allow_descriptors()
             self._server = ForkServer(copy=True)
             for stage in self._stages:
                 if stage.name in apart:

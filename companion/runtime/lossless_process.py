@@ -42,7 +42,7 @@ class LosslessProcess:
     def fault(self) -> BaseException | None:
         """Exception that has ended it; None without one."""
         process = self._process
-        if not process.why or process.finished is not None:
+        if not process.why or process.has_finished:
             return None
         if process.failed is not None:
             return process.failed.error()

@@ -197,7 +197,7 @@ class Processes:
                 hurry_s is not None and now_s > max(began_s, hurry_s) + stage.hurried_s
             ):
                 break
-        if process.finished is None:
+        if not process.has_finished:
             late[stage.name] = process.failed.why if process.failed is not None else ""
 
     def _start(self, stage: Stage) -> StageProcess:

@@ -116,7 +116,7 @@ def _serve(
     threading.Thread(target=loop.report, args=(send,), name="reports", daemon=True).start()
     loop.run(send)
     send(loop.progress())
-    send(Finished(work.times.summary(), work.device))
+    send(Finished())
 
 
 class _Loop:

@@ -58,7 +58,8 @@ class StageProcess:
         self.stage = stage
         self.progress: Progress | None = None
         """None until the stage is ready."""
-        self.finished: Finished | None = None
+        self.has_finished = False
+        """True once all its results are given."""
         self.failed: Failed | None = None
         self._interrupted: str | None = None
         self._not_sent = ""
@@ -243,7 +244,7 @@ class StageProcess:
         elif isinstance(report, Failed):
             self.failed = report
         elif isinstance(report, Finished):
-            self.finished = report
+            self.has_finished = True
 
 
 REPORTS = {kind.__name__ for kind in (Taken, Progress, Remark, DriverAtWork, Failed, Finished)}

@@ -206,7 +206,4 @@ class Failed:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """All results are given."""
-
-    times: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    device: str = ""
+    """All results are given, and the last progress told."""

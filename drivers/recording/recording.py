@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,12 +30,9 @@ class PicturePlace(NamedTuple):
 
 
 class Recording:
-    """An open recording and its content; FlightError if invalid.
+    """An open recording and its content; FlightError if invalid."""
 
-    `on_progress` takes, chunk by chunk, the bytes read.
-    """
-
-    def __init__(self, path: Path, on_progress: Callable[[int], None] = lambda _: None) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.file, self.found = opened(path)
         self.pictures: list[PicturePlace] = []
@@ -56,7 +52,6 @@ class Recording:
             raise FlightError(f"{path}: an MCAP file, but not a recording of companion")
         for number, chunk in enumerate(self.found.chunks):
             self._index(number, chunk)
-            on_progress(chunk.end)
         self.pictures = _once_in_order(self.pictures)
         self.samples.sort(key=lambda sample: sample.t_ns)
 

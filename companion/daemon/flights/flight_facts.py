@@ -23,7 +23,7 @@ def facts_of(
     times: dict[str, Mapping[str, float]] = {}
     device = "none"
     for stage in flight.stages.values():
-        said = stage.finished or stage.progress
+        said = stage.progress
         if said is not None:
             times.update(said.times)
             device = said.device or device

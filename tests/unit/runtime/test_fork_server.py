@@ -72,7 +72,7 @@ def test_a_stage_is_a_child_of_the_server_under_its_name_and_finishes(server: Fo
     viewers.stage.ask_to_finish(Finish(hurry=True))
     assert viewers.stage.wait(PATIENCE_S)
     assert viewers.end() == ""
-    assert viewers.stage.finished is not None and not viewers.stage.alive
+    assert viewers.stage.has_finished and not viewers.stage.alive
 
 
 def test_a_prepared_stage_is_the_process_that_waited(server: ForkServer) -> None:

@@ -119,7 +119,7 @@ def test_messages_are_answered_in_order_and_the_last_words_are_heard(start: Star
     assert tiny.why() == ""
     words = [("told", str(n)) for n in range(50)] + [("last words", "at leisure")]
     assert tiny.heard.all == [Said(0 if who == "last words" else 1, who, w) for who, w in words]
-    assert tiny.stage.finished is not None
+    assert tiny.stage.has_finished
     assert tiny.stage.n_dropped == 1
     assert not tiny.process.alive and tiny.process.driver is None
 
@@ -140,7 +140,7 @@ def test_what_dies_by_itself_says_why(start: Start, tmp_path: Path) -> None:
         tiny.do(*told)
     for tiny, _, why in begun:
         assert tiny.why() == why
-        assert not tiny.process.was_interrupted and tiny.stage.finished is None
+        assert not tiny.process.was_interrupted and not tiny.stage.has_finished
         failed, driver = tiny.stage.failed, tiny.process.driver
         assert (failed is not None) is (why not in ("ended with status 3", "killed by SIGSEGV"))
         if failed is not None and failed.is_foreseen:
@@ -258,7 +258,7 @@ def test_a_stage_that_is_asked_to_end_does_not_hang(start: Start) -> None:
     assert not tiny.stage.wait(0.0)
     tiny.process.kill()
     assert tiny.why() == "", "it was asked to"
-    assert tiny.stage.finished is None and tiny.heard.texts("last words") == []
+    assert not tiny.stage.has_finished and tiny.heard.texts("last words") == []
 
 
 def test_frames_are_dropped_for_newer_ones_and_nothing_else_is(start: Start) -> None:

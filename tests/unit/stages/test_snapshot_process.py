@@ -77,6 +77,6 @@ def test_a_snapshot_and_another(tmp_path: Path, rng: np.random.Generator) -> Non
                 blocked.rmdir()
         stage.ask_to_finish(Finish(hurry=True))
         assert stage.wait(PATIENCE_S)
-        assert stage.finished is not None
+        assert stage.has_finished
     finally:
         stage.kill()
