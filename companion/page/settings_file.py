@@ -22,6 +22,7 @@ from companion.config_file import (
 )
 from companion.errors import ConfigError
 from companion.products.atomic_file import write_atomically
+from drivers.images.calibration_file import own_calibration
 
 CHANGES = ".page-changes.json"
 MOST_CHANGES = 50
@@ -53,7 +54,9 @@ class SettingsFile:
         self._changes = flights / CHANGES
 
     def set(self, wanted: Mapping[str, Any]) -> list[Change]:
-        """Set keys, all or none; None takes a key out of the file. ConfigError with what is wrong.
+        """Set keys, all or none; None takes a key out of the file.
+
+        ConfigError with what is wrong, FlightError with what is of the calibration that is named.
 
         The file stays as it was unless all of it is valid with the new values.
         """
@@ -72,6 +75,9 @@ class SettingsFile:
         }:
             raise ConfigError(f"{path}: is written too unusually to be changed from the page")
         self._check(text)
+        calibration = wanted.get("camera.calibration")
+        if calibration:  # with a wrong one no daemon starts, nor the page that could mend it
+            own_calibration(Path(calibration))
         try:
             write_atomically(path, text.encode(), durable=True, like=path if before else None)
         except OSError as error:

@@ -15,8 +15,8 @@ from drivers.camera.pattern_camera import pattern_optics
 from drivers.images.calibration_file import (
     assumed_camera,
     configured_rotation,
+    own_calibration,
     read_calibration,
-    stated_size,
     states_gimbal,
     with_mount,
     with_readout,
@@ -68,8 +68,8 @@ def check_calibration(config: CameraConfig, mount: MountConfig) -> None:
     """Raise what `live_camera` will for pictures of any size, before there is a camera."""
     file = _calibration_file(config)
     if file is not None:
-        width, height = stated_size(file)
-        live_camera(config, mount, int(width), int(height))
+        own = own_calibration(file)
+        live_camera(config, mount, own.width, own.height)
 
 
 def is_on_gimbal(config: CameraConfig, mount: MountConfig) -> bool:

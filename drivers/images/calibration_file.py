@@ -72,9 +72,10 @@ def read_calibration(path: Path, width: int, height: int) -> Camera:
     )  # fmt: skip
 
 
-def stated_size(path: Path) -> tuple[float, float]:
-    """Width and height of the pictures that a calibration is for; FlightError if unreadable."""
-    return _size(path, _content(path))
+def own_calibration(path: Path) -> Camera:
+    """Camera of a file, for pictures of the size that it states itself; FlightError if invalid."""
+    width, height = _size(path, _content(path))
+    return read_calibration(path, int(width), int(height))
 
 
 def states_gimbal(path: Path) -> bool:

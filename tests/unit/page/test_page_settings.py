@@ -89,6 +89,15 @@ def test_impossible_values_are_refused_in_words(
     assert served.config.read_text() == FILE
 
 
+def test_a_calibration_with_which_the_daemon_would_not_start_is_refused(served: ServedPage) -> None:
+    wrong = served.folder / "lens.toml"
+    answer = save(served, camera__calibration=str(wrong))
+    assert answer.status == 409 and "lens.toml: cannot be read" in answer.text
+    wrong.write_text("width = 640\nheight = 480\n")
+    assert "the key fx is missing" in save(served, camera__calibration=str(wrong)).text
+    assert served.config.read_text() == FILE
+
+
 def test_what_was_changed_is_listed_and_undone(served: ServedPage) -> None:
     save(served, expert__features__n_features="1000", depth__enabled="false")
     answer = save(served, camera__url="rtsp://eye:hidden@10.0.0.2/live")
