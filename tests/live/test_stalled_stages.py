@@ -17,11 +17,11 @@ IMPATIENT = f"""
 import sys
 from dataclasses import replace
 from companion.runtime.governor import Governor
-from companion.daemon.flights import live_flight
+from companion.daemon.flights import flown_stages
 Governor.step = lambda self, t_ns, pressure: False
-live_flight.STAGES = [
+flown_stages.STAGES = [
     replace(stage, answer_s={ANSWER_S}) if stage.in_folder else stage
-    for stage in live_flight.STAGES
+    for stage in flown_stages.STAGES
 ]
 from companion.__main__ import main
 sys.exit(main())
