@@ -356,7 +356,7 @@ class LocalisationStage:
             yield from self._margin.take(
                 next(m for m in tracked if isinstance(m, Track) and m.seq == frame.seq),
                 tracker.view_of(frame.seq), tracker.map, tracker.n_features, tracker.feature_ratio,
-                tracker.drowned,
+                tracker.nearly_drowned,
             )  # fmt: skip
         yield from self._checks.check(frame.t_ns)
         if self._gimbal is not None and self._attitude.used:

@@ -1,4 +1,4 @@
-"""A picture that stands while the vehicle flies on is tracked as well as ground: not believed."""
+"""Pictures that stand while the vehicle flies on, and such of noise, are not called tracked."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pytest
 from companion.estimation.attitude_checks import SIGHT_STANDS
 from companion.geometry.camera import Camera
 from companion.messages import Bytes, TrackState
+from companion.slam.features.faint_pictures import detail_of
 from tests.support.flights.rendered_flight import (
     CAMERA_DOWN,
     START_NS,
@@ -76,3 +77,23 @@ def test_no_pose_is_sent_that_stands(flown: Flown) -> None:
     for s in off_m:
         assert s < STANDS_S + KNOWN_S + 0.35
         assert s < STANDS_S or np.linalg.norm(off_m[s] - last_m) < 1.0
+
+
+DARK_S, LIGHT_S = 6.0, 7.5
+
+
+def dark(after_s: float, grey: Bytes) -> Bytes:
+    """Dusk for a while, in which the ground's detail is a third of the noise."""
+    if not DARK_S <= after_s < LIGHT_S:
+        return grey
+    seen = 128.0 + 0.33 * NOISE / detail_of(grey, 0.0) * (grey - 128.0)
+    noise = np.random.default_rng(round(after_s * RATE_HZ)).normal(0, NOISE, grey.shape)
+    return np.asarray(np.clip(seen + noise, 0, 255), np.uint8)
+
+
+def test_a_picture_drowned_in_noise_is_not_tracked_and_afterwards_the_ground_is_again() -> None:
+    path = leaning_path(weaving, lambda after_s: 0.2 * np.sin(0.5 * after_s))
+    flown = fly(CAMERA, path, Terrain(3, plane=True), LIGHT_S + 2.0, RATE_HZ, seen=dark)
+    tracked_s = [since_s(t.t_ns) for t in flown.tracks if t.state is TrackState.TRACKING]
+    assert max(s for s in tracked_s if s < LIGHT_S) < DARK_S
+    assert len([s for s in tracked_s if s > LIGHT_S + 0.5]) > 0.9 * 1.5 * RATE_HZ

@@ -56,7 +56,7 @@ class FeaturesAhead:
 
     def _extracted(self, grey: Bytes) -> _Extracted:
         before = self._own.state
-        features = self._own.extract(strengthened(grey))
+        features = self._own.extract(strengthened(grey).corners)
         return before, features, self._own.state
 
 

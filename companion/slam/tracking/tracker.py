@@ -15,7 +15,7 @@ from companion.config import Config
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, angle_between
 from companion.messages import Bytes, Frame, KeyframeAdded, LoopClosed, Track, TrackState
-from companion.slam.features.faint_pictures import is_drowned, strengthened
+from companion.slam.features.faint_pictures import strengthened
 from companion.slam.features.features_ahead import FeaturesAhead
 from companion.slam.features.orb_features import FeatureExtractor, Features
 from companion.slam.features.view import View
@@ -82,8 +82,9 @@ class Tracker:
         self._ahead = FeaturesAhead(config.features, camera, self._extractor)
         self.n_features = 0
         """Features seen in the last frame,"""
-        self.drowned = False
+        self.nearly_drowned = False
         """which may be of noise."""
+        self._drowned = False
         self._is_live = background
         self._next_keyframe_id = 0
         self.map_lock = MapLock(order)
@@ -129,10 +130,10 @@ class Tracker:
         with self._times("features"):
             features = self._ahead.take(frame.grey)
             strong = strengthened(frame.grey)
-            self.drowned = strong is not frame.grey and is_drowned(strong)
-            frame = replace(frame, grey=strong)
+            self._drowned, self.nearly_drowned = strong.drowned, strong.nearly_drowned
+            frame = replace(frame, grey=strong.patches)
             if features is None:
-                features = self._extractor.extract(frame.grey)
+                features = self._extractor.extract(strong.corners)
         self.n_features = len(features)
         return self._track_frame(frame, features, prior) + self._worker.done()
 
@@ -208,7 +209,7 @@ class Tracker:
         )  # fmt: skip
         view.map_from_camera_rotation = prior.map_from_camera_rotation
         with self._times("tracking"):
-            found = self._track(view, prior)
+            found = not self._drowned and self._track(view, prior)
         if not found:
             return self._lost(frame, features, prior)
         self.state = TrackState.TRACKING
@@ -222,6 +223,8 @@ class Tracker:
     # -- initialising ---------------------------------------------------------------------------
 
     def _initialise(self, frame: Frame, features: Features, prior: Prior) -> list[TrackerOutput]:
+        if self._drowned:
+            return [Track(frame.seq, frame.t_ns, self.state)]
         with self._times("initialising"):
             start = self._bootstrap.step(frame, features, prior.ned_from_camera)
         continuation = None
