@@ -42,7 +42,7 @@ from companion.messages import Bytes, Frame, KeyframeAdded, Odometry, TrackState
 from companion.products.array_file import ArrayFile  # noqa: E402
 from companion.products.site_map_file import write_site_map  # noqa: E402
 from companion.runtime.in_order import in_order_of_time  # noqa: E402
-from companion.slam.map.sparse_map import SlamMap  # noqa: E402
+from companion.slam.map.map_part import map_of, part_of  # noqa: E402
 from companion.timing.clock import StageTimes  # noqa: E402
 from drivers.system.heap import bound_heap  # noqa: E402
 from tests.support.flights.rendered_flight import (  # noqa: E402
@@ -131,26 +131,25 @@ def frames(n: int) -> Iterator[Frame]:
 def join_copies(stage: LocalisationStage, file: ArrayFile, n: int) -> None:
     """Join the map with copies of itself, as if these had been flown before."""
     slam_map, database = stage._tracker.map, stage._tracker.atlas._database
-    keyframes, n_points = dict(slam_map.keyframes), slam_map.n_points
-    first = SlamMap(slam_map.scale_factor, slam_map.n_levels)
-    first.append_points(slam_map, Similarity.identity())
+    first = map_of(part_of(slam_map, slam_map.keyframes), slam_map.scale_factor, slam_map.n_levels)
     for i in range(1, n + 1):
         away = np.array([i * COPIES_APART, 0.0, 0.0])
         offset = slam_map.append_points(first, Similarity(1.0, np.eye(3), away))
-        ids = np.arange(offset, offset + n_points)
+        ids = np.arange(offset, offset + first.n_points)
         for each in (slam_map.observers, slam_map.born, slam_map.first_seen):
             each[ids] -= np.where(each[ids] >= 0, i * IDS_APART, 0)
         ids = ids[slam_map.patch_at[ids] >= 0]
         (grey,) = file.put([slam_map.patches_of(ids).grey]) or [None]
         slam_map.put_patches_away(ids, grey)
-        for key, keyframe in keyframes.items():
+        for key, keyframe in first.keyframes.items():
             copy = replace(
                 keyframe, keyframe_id=key - i * IDS_APART,
                 camera_from_map=keyframe.camera_from_map @ Pose(np.eye(3), -away),
                 point_ids=np.where(keyframe.point_ids >= 0, keyframe.point_ids + offset, -1),
-                t_ns=keyframe.t_ns - i * 3_600_000_000_000, grey=None,
+                t_ns=keyframe.t_ns - i * 3_600_000_000_000,
             )  # fmt: skip
             slam_map.keyframes[copy.keyframe_id] = copy
+            slam_map.leave_behind(copy)
             database.add(copy.keyframe_id, copy.features.descriptors)
     slam_map.keyframes = dict(sorted(slam_map.keyframes.items()))
     slam_map.keyframes_moved()
