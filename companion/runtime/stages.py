@@ -85,7 +85,7 @@ class Stage:
 STAGES = (
     Stage(
         "localisation", (Frame, FrameOverdue, GeoOrigin, *TELEMETRY), nice=0, frames=Frames.NEWEST,
-        finish_s=120.0, hurried_s=0.7, death=Death.ENDS_FLIGHT, is_source=True,
+        finish_s=300.0, hurried_s=0.7, death=Death.ENDS_FLIGHT, is_source=True,
     ),
     Stage(
         "depth", (Frame, Track, KeyframeAdded, MapUpdate), nice=20, answer_s=120.0, is_source=True,
