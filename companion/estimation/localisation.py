@@ -57,8 +57,8 @@ from companion.telemetry import Telemetry
 from companion.timing.clock import Timer
 
 FINAL_ITERATIONS, OF_LARGE_MAP = 8, 2
-"""Iterations of the final global adjustment; 4 and 16 give the sample flight within 0.1 mm. A map of
-more than MAX_VARIABLE keyframes takes with four a second for each hundred."""
+"""Iterations of the final global adjustment; 4 and 16 give the sample flight within 0.1 mm. With
+four a map of more than MAX_VARIABLE keyframes takes a second for each hundred."""
 TELEMETRY_KEPT_NS = 600_000_000_000
 """Older telemetry is only needed at the times of keyframes."""
 MAX_HEAD_TURN_RAD = np.radians(10.0)
