@@ -29,6 +29,10 @@ class DropPolicy(IntEnum):
     """Control message: never dropped."""
 
 
+GATHERED = DropPolicy.LOSSLESS
+"""Messages that may be let gather, and be taken out together."""
+
+
 class Mailbox(Generic[T]):
     """Queue of messages, at most `capacity_bytes` of them; may be used from any thread.
 
@@ -51,8 +55,9 @@ class Mailbox(Generic[T]):
         """By policy: arrival number, size in bytes, message."""
         self._n_put = 0
         self._closed = False
-        self._waits = False
-        """True while `collect` waits."""
+        self._waits = self._pauses = False
+        """True while `collect` waits; while it lets small messages gather, and is not woken."""
+        self._gather_bytes = 0
         self._changed = threading.Condition()
         self.n_bytes = 0
         """Size of the waiting messages."""
@@ -78,19 +83,27 @@ class Mailbox(Generic[T]):
             self.n_bytes += size
             while self.n_bytes > self._capacity_bytes and self._drop_lowest():
                 self.n_overflowed += 1
-            self._changed.notify_all()
+            if not self._pauses or policy is not GATHERED or self.n_bytes > self._gather_bytes:
+                self._changed.notify_all()
 
     def get(self) -> T | None:
         """Oldest message; waits for one. None once it is closed and empty."""
-        return next(iter(self.collect(-1)), None)
+        return next(iter(self.collect(-1, 0.0)), None)
 
-    def collect(self, most_bytes: int) -> list[T]:
+    def collect(self, most_bytes: int, pause_s: float) -> list[T]:
         """Oldest message; LOSSLESS ones in a row together, up to `most_bytes`. Waits for one.
 
-        Empty once it is closed and empty.
+        Where nothing waits, LOSSLESS ones are let gather for `pause_s`, or until they are more
+        than `most_bytes`: waking a thread for each costs more than sending it. Empty once it is
+        closed and empty.
         """
         with self._changed:
+            self._gather_bytes = most_bytes
             self._waits = not self._has_any()
+            if self._waits and pause_s:
+                self._pauses = True
+                self._changed.wait_for(self._is_urgent, pause_s)
+                self._pauses = False
             self._changed.wait_for(lambda: self._closed or self._has_any())
             self._waits = False
             taken: list[T] = []
@@ -99,11 +112,11 @@ class Mailbox(Generic[T]):
                 policy = self._oldest()
                 _, size, message = self._waiting[policy][0]
                 n_bytes += size
-                if taken and (policy is not DropPolicy.LOSSLESS or n_bytes > most_bytes):
+                if taken and (policy is not GATHERED or n_bytes > most_bytes):
                     break
                 self._drop(policy)
                 taken.append(message)
-                if policy is not DropPolicy.LOSSLESS:
+                if policy is not GATHERED:
                     break
             if self._is_lossless:
                 self._changed.notify_all()
@@ -128,6 +141,14 @@ class Mailbox(Generic[T]):
 
     def _has_any(self) -> bool:
         return any(self._waiting.values())
+
+    def _is_urgent(self) -> bool:
+        """True if there is more than a few small messages."""
+        return (
+            self._closed
+            or self.n_bytes > self._gather_bytes
+            or any(held for policy, held in self._waiting.items() if policy is not GATHERED)
+        )
 
     def _oldest(self) -> DropPolicy:
         """Policy of the oldest message."""

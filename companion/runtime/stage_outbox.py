@@ -1,7 +1,4 @@
-"""Queue of messages to the process of a stage, and how they are sent: at once, or gathered.
-
-Whoever has a message sends it where the process takes it: handing it over to a thread costs more.
-"""
+"""Queue of messages to the process of a stage, and how they are sent: at once, or gathered."""
 
 from __future__ import annotations
 
@@ -9,8 +6,6 @@ import socket
 import threading
 from functools import cache
 
-from companion.flight_notes import GateStep, HealthNote, LinkReads
-from companion.messages import FrameTracked, Odometry, OpticalFlow
 from companion.runtime.mailbox import Mailbox
 from companion.runtime.parcel import INLINE_BYTES, Parcel
 from companion.runtime.stages import QUEUE_BYTES, UNREAD_BYTES, Frames, Stage, drop_policy
@@ -18,24 +13,20 @@ from companion.telemetry import TELEMETRY
 from companion.timing.clock import monotonic_s
 
 GATHER_S = 0.05
-"""Messages of which many come gather for this long, or until one of another kind;"""
+"""Small messages gather for this long, or until a frame;"""
 HELD_S = 0.02
 """samples for localisation, which takes them with its next frame only, for this long: a frame never
 waits for more than a few of them to be opened."""
 MOST_HELD = 64
-"""Messages in a packet, of INLINE_BYTES at most: samples have some 200 each."""
-GATHERED = {
-    kind.__name__
-    for kind in (*TELEMETRY, LinkReads, HealthNote, FrameTracked, GateStep, Odometry, OpticalFlow)
-}
-"""After these others come soon: frames, if not more of them."""
+"""Samples of some 200 bytes each: a packet holds INLINE_BYTES of them."""
+SAMPLES = {kind.__name__ for kind in TELEMETRY}
 
 
 class StageOutbox:
     """Messages that wait for a stage, and go through its socket.
 
-    `send_all` is for a thread that sends what could not be sent at once. Where the queue is full
-    messages are dropped; with `waits` whoever has another waits.
+    `send_all` is for a thread that does nothing else. Where a queue is full messages are dropped;
+    with `waits` whoever has another waits.
     """
 
     def __init__(self, stage: Stage, to: socket.socket, waits: bool) -> None:
@@ -44,10 +35,10 @@ class StageOutbox:
             lambda parcel: policy(parcel.kind), lambda parcel: parcel.n_bytes, QUEUE_BYTES, waits
         )
         self._socket = to
-        self._hold_s = HELD_S if stage.frames is Frames.NEWEST else GATHER_S
+        self._is_prompt = stage.frames is Frames.NEWEST
         self._held: list[Parcel] = []
-        """Messages that gather for one packet."""
-        self._held_since_s, self._held_bytes = 0.0, 0
+        """Samples that gather for one packet."""
+        self._held_since_s = 0.0
         self._puts = threading.Lock()
         """Keeps what is sent at once in order with what waits."""
         self._n_sent = self._n_taken = 0
@@ -63,20 +54,26 @@ class StageOutbox:
     @property
     def n_bytes(self) -> int:
         """Bytes of messages that wait."""
-        return self._waiting.n_bytes + self._held_bytes
+        return self._waiting.n_bytes
 
     def put(self, parcel: Parcel) -> None:
-        """Send a message, or let it gather or wait."""
+        """Send a message now where nothing waits and the socket takes it, else let it wait.
+
+        Handing it over to the thread that sends costs more than sending it.
+        """
+        if not self._is_prompt:
+            self._waiting.put(parcel)
+            return
         with self._puts:
-            if self._held_bytes + parcel.n_bytes > INLINE_BYTES:
+            if parcel.kind not in SAMPLES:
                 self._let_go()
+                self._go([parcel])
+                return
             now_s = monotonic_s()
             if not self._held:
                 self._held_since_s = now_s
             self._held.append(parcel)
-            self._held_bytes += parcel.n_bytes
-            is_due = now_s - self._held_since_s >= self._hold_s or len(self._held) >= MOST_HELD
-            if parcel.kind not in GATHERED or is_due:
+            if now_s - self._held_since_s >= HELD_S or len(self._held) >= MOST_HELD:
                 self._let_go()
 
     def close(self) -> None:
@@ -97,9 +94,10 @@ class StageOutbox:
             self._was_taken.notify()
 
     def send_all(self) -> str:
-        """Send what waits, until it is closed or the process gone; why that could not be, or ""."""
+        """Send what comes, until it is closed or the process gone; why that could not be, or ""."""
         try:
-            while parcels := self._waiting.collect(INLINE_BYTES):
+            pause_s = 0.0 if self._is_prompt else GATHER_S
+            while parcels := self._waiting.collect(INLINE_BYTES, pause_s):
                 if parcels[0].is_shared and not self._has_room(parcels[0].n_bytes):
                     break
                 Parcel.send_together(parcels, self._socket)
@@ -110,13 +108,14 @@ class StageOutbox:
         return ""
 
     def _let_go(self) -> None:
-        """Send what has gathered now where nothing waits and the socket takes it, else let it wait.
+        """Send the samples that have gathered."""
+        if self._held:
+            held, self._held = self._held, []
+            self._go(held)
 
-        One that is shared is alone: it has more than INLINE_BYTES.
-        """
-        held, self._held, self._held_bytes = self._held, [], 0
-        if held and not (self._waiting.is_idle and self._are_sent(held)):
-            for parcel in held:
+    def _go(self, parcels: list[Parcel]) -> None:
+        if not (self._waiting.is_idle and self._are_sent(parcels)):
+            for parcel in parcels:
                 self._waiting.put(parcel)
 
     def _are_sent(self, parcels: list[Parcel]) -> bool:

@@ -112,6 +112,7 @@ def test_a_stage_that_takes_nothing_for_an_hour_stays_within_its_capacity() -> N
 
 
 SMALL, LARGE, ORDER = DropPolicy.LOSSLESS, DropPolicy.PICTURE, DropPolicy.ALWAYS
+LONG_S = 60.0
 
 
 def test_small_messages_are_taken_together_and_all_in_their_order() -> None:
@@ -121,9 +122,37 @@ def test_small_messages_are_taken_together_and_all_in_their_order() -> None:
         box.put((policy, 10, str(number)))
     box.close()
     taken: list[str] = []
-    while found := box.collect(30):
+    while found := box.collect(30, 0.0):
         taken.append("".join(name for _, _, name in found))
     assert taken == ["0", "12", "3", "456", "7", "8", "9"]
+
+
+@pytest.mark.parametrize(
+    "ends_it", [(LARGE, 1, "frame"), (ORDER, 1, "order"), (SMALL, 21, "many"), None]
+)
+def test_small_messages_gather_until_there_is_more(ends_it: Sent | None) -> None:
+    box = mailbox()
+    taken: list[list[Sent]] = []
+    taker = threading.Thread(target=lambda: taken.append(box.collect(30, LONG_S)))
+    taker.start()
+    small = (SMALL, 10, "small")
+    box.put(small)
+    taker.join(0.1)
+    assert taker.is_alive() and not taken, "a small message wakes nobody"
+    if ends_it is None:
+        box.close()
+    else:
+        box.put(ends_it)
+    taker.join(LONG_S / 2)
+    assert taken == [[small]]
+
+
+def test_small_messages_gather_no_longer_than_that() -> None:
+    box = mailbox()
+    box.put((SMALL, 10, "0"))
+    assert len(box.collect(30, LONG_S)) == 1, "what waits is taken at once"
+    threading.Timer(0.01, box.put, [(SMALL, 10, "1")]).start()
+    assert [name for _, _, name in box.collect(30, 0.05)] == ["1"]
 
 
 def test_it_is_idle_while_somebody_waits_for_the_next_message() -> None:
