@@ -29,8 +29,8 @@ class Sender:
         """Send what is due between frames, until cancelled; most have nothing."""
 
     def health(self) -> Any:
-        """Health now."""
-        raise NotImplementedError
+        """Health now; None without a name."""
+        return None
 
     def take_warning(self, warning: Warned) -> None:
         """Take a warning of localisation; those that change its verdict on satellites count."""
@@ -39,5 +39,4 @@ class Sender:
             self.doubt_satellites(doubted)
 
     def doubt_satellites(self, doubted: bool) -> None:
-        """Satellites are doubted, or are not any more."""
-        raise NotImplementedError
+        """Satellites are doubted, or are not any more; most do not care."""
