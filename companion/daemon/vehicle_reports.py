@@ -12,10 +12,10 @@ import numpy as np
 from companion.config import Config, FeedbackConfig
 from companion.daemon.flights.flights import Flights
 from companion.daemon.health_watch import HealthWatch
-from companion.dense.obstacle_finder import ObstacleFinder
-from companion.dense.obstacles import FREE_M, MAX_M, unknown
 from companion.geometry.camera import Camera
 from companion.messages import DepthMap, Frame, MapUpdate, PointChunk, Track
+from companion.obstacles.obstacle_finder import ObstacleFinder
+from companion.obstacles.obstacle_sectors import FREE_M, MAX_M, unknown
 from companion.pilot_messages import RECORDING_NO_FLIGHT, RECORDING_SET_OFF, PilotText
 from companion.timing.clock import FlightClock
 from drivers.images.still_pictures import StillPictures

@@ -16,7 +16,6 @@ from companion.estimation.attitude_checks import AttitudeChecks
 from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.body_odometry import BodyOdometry
 from companion.estimation.camera_motion import CameraMotion
-from companion.estimation.checkpoint import Checkpoint
 from companion.estimation.flow_of_frames import FlowOfFrames
 from companion.estimation.georeference.georeferencer import Georeferencer
 from companion.estimation.georeference.segment_georeference import SegmentGeoreferences
@@ -25,14 +24,15 @@ from companion.estimation.inertial.acceleration_integral import AccelerationInte
 from companion.estimation.inertial.judged_acceleration import JudgedAcceleration
 from companion.estimation.lift_off.optical_flow import FlowMeter
 from companion.estimation.lift_off.standing import Standing
-from companion.estimation.map_resumption import MAP_RESUMED, MapResumption
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
+from companion.estimation.odometry.tracking_margin import TrackingMargin
+from companion.estimation.resumption.checkpoint import Checkpoint
+from companion.estimation.resumption.map_resumption import MAP_RESUMED, MapResumption
 from companion.estimation.satellites.satellite_watch import SatelliteWatch
 from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
 from companion.estimation.site.site_in_flight import SiteInFlight
 from companion.estimation.site.site_use import DOUBTED, SiteUse
 from companion.estimation.telemetry_intake import TelemetryIntake
-from companion.estimation.tracking_margin import TrackingMargin
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, Pose

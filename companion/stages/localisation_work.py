@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from companion.estimation.checkpoint import CheckpointError
 from companion.estimation.localisation import LocalisationStage
+from companion.estimation.resumption.checkpoint import CheckpointError
 from companion.estimation.site.site_use import SiteUse
 from companion.messages import (
     Bytes,

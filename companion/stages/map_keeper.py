@@ -14,7 +14,7 @@ import threading
 from pathlib import Path
 from typing import NamedTuple
 
-from companion.estimation.checkpoint import (
+from companion.estimation.resumption.checkpoint import (
     Checkpoint,
     CheckpointError,
     decode,
@@ -22,7 +22,7 @@ from companion.estimation.checkpoint import (
     fingerprint,
     read_arrays,
 )
-from companion.estimation.resumption import MAX_ABSENT_NS
+from companion.estimation.resumption.map_verification import MAX_ABSENT_NS
 from companion.products.atomic_file import write_atomically
 from companion.runtime.stage_protocol import Setup
 from companion.timing.clock import since_boot_ns

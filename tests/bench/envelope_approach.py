@@ -16,7 +16,7 @@ import argparse
 import numpy as np
 
 from companion.estimation.gate.pose_to_send import PoseToSend
-from companion.estimation.tracking_margin import TOO_FAINT, TOO_FAST, TOO_FEW
+from companion.estimation.odometry.tracking_margin import TOO_FAINT, TOO_FAST, TOO_FEW
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Bytes, TrackState

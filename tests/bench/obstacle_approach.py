@@ -21,10 +21,17 @@ import numpy as np
 
 from companion.config_file import load_config
 from companion.daemon.vehicle_reports import VehicleReports
-from companion.dense.obstacles import ABOVE_M, BELOW_M, FREE_M, MAX_M, SECTOR_DEG, UNKNOWN_CM
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, yaw_rotation
 from companion.messages import DepthMap, Frame, MapUpdate, Message, PointChunk, Track
+from companion.obstacles.obstacle_sectors import (
+    ABOVE_M,
+    BELOW_M,
+    FREE_M,
+    MAX_M,
+    SECTOR_DEG,
+    UNKNOWN_CM,
+)
 from companion.runtime.in_order import InOrder, in_order_of_time
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stages import stage_named

@@ -15,7 +15,7 @@ import pytest
 
 from companion.config import Config
 from companion.estimation.localisation import LocalisationStage
-from companion.estimation.map_resumption import MAP_RESUMED
+from companion.estimation.resumption.map_resumption import MAP_RESUMED
 from companion.estimation.site.site_use import DOUBTED, LOCATED, OTHER_CAMERA, SiteUse
 from companion.geometry.transforms import Pose
 from companion.messages import Frame, MapUpdate, Message, Odometry, Track, Warned

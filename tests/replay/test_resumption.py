@@ -16,10 +16,16 @@ import numpy as np
 import pytest
 
 from companion.config import Config
-from companion.estimation.checkpoint import MAX_BYTES, Checkpoint, decode, encode, read_arrays
 from companion.estimation.localisation import LocalisationStage
-from companion.estimation.map_resumption import MAP_NOT_RECOGNISED, MAP_RESUMED
-from companion.estimation.resumption import TIMEOUT_NS
+from companion.estimation.resumption.checkpoint import (
+    MAX_BYTES,
+    Checkpoint,
+    decode,
+    encode,
+    read_arrays,
+)
+from companion.estimation.resumption.map_resumption import MAP_NOT_RECOGNISED, MAP_RESUMED
+from companion.estimation.resumption.map_verification import TIMEOUT_NS
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import (
     quaternion_from_rotation,

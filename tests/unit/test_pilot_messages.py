@@ -14,9 +14,9 @@ from companion.daemon.control import armed_settings
 from companion.daemon.control.flight_parameters import PARAMETERS
 from companion.daemon.flights import live_flight, recording_recovery, viewing
 from companion.daemon.pose import pose_sender
-from companion.estimation import map_resumption
 from companion.estimation.gate import pose_gate, pose_rules
 from companion.estimation.inertial import imu_verdict
+from companion.estimation.resumption import map_resumption
 from companion.estimation.shutter import shutter_of_frames
 from companion.messages import Warned
 from companion.pilot_messages import (

@@ -16,12 +16,12 @@ from companion.app.progress import Progress
 from companion.app.replay.sent_again import SentAgain, steps_as_tracked
 from companion.config import Config
 from companion.errors import FlightError, StageError
-from companion.estimation.checkpoint import CheckpointError, decode, read_arrays
 from companion.estimation.gate.gate_journal import OBSTACLES
 from companion.estimation.gate.gates_again import placed_values
 from companion.estimation.landing.marker_detector import MarkerDetector
 from companion.estimation.localisation import LocalisationStage
-from companion.estimation.map_resumption import MAP_NOT_RECOGNISED, MAP_RESUMED
+from companion.estimation.resumption.checkpoint import CheckpointError, decode, read_arrays
+from companion.estimation.resumption.map_resumption import MAP_NOT_RECOGNISED, MAP_RESUMED
 from companion.estimation.satellites.satellite_watch import doubts
 from companion.estimation.site.site_use import SiteUse
 from companion.geometry.camera import Camera

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.dense.obstacles import MAX_M, MIN_M, SECTOR_DEG, Obstacles
 from companion.geometry.transforms import Array
+from companion.obstacles.obstacle_sectors import MAX_M, MIN_M, SECTOR_DEG, Obstacles
 
 NO_ID = 65535
 """Obstacles are not followed from one round to the next."""

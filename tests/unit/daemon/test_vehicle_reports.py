@@ -13,8 +13,6 @@ import pytest
 
 from companion.config import Config, FeedbackConfig
 from companion.daemon.vehicle_reports import UNKNOWN_AFTER_NS, VehicleReports
-from companion.dense.obstacle_finder import MAX_AGE_NS
-from companion.dense.obstacles import FREE_M, STAYS_S
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import (
@@ -28,10 +26,13 @@ from companion.messages import (
     Track,
     TrackState,
 )
+from companion.obstacles.obstacle_finder import MAX_AGE_NS
+from companion.obstacles.obstacle_sectors import FREE_M
+from companion.obstacles.recent_cloud import STAYS_S
 from drivers.mavlink.vehicle import Firmware, Vehicle
 from tests.support.autopilot.memory_link import SetClock, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
-from tests.unit.dense.test_newest_sight import SCENE
+from tests.unit.obstacles.test_newest_sight import SCENE
 
 S = 1_000_000_000
 FORWARD = Pose(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.zeros(3))

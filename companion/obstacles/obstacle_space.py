@@ -13,8 +13,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from companion.dense.obstacles import BELOW_M, MAX_M, MIN_M, MIN_POINTS, bearings_of
 from companion.geometry.transforms import Array, Pose
+from companion.obstacles.obstacle_sectors import BELOW_M, MAX_M, MIN_M, MIN_POINTS, bearings_of
 
 Mask = NDArray[np.bool_]
 Ints = NDArray[np.int64]

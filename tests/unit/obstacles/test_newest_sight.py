@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.dense.newest_sight import NewestSight, Seen, things_in
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, Similarity, rotation_from_vector
 from companion.messages import Track, TrackState
+from companion.obstacles.newest_sight import NewestSight, Seen, things_in
 from tests.support.flights.approach_scene import ApproachScene, Rod, Sheet
 
 AHEAD = Pose(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.zeros(3))

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.dense.obstacles import ABOVE_M, BELOW_M
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array
 from companion.messages import Bytes, Floats
+from companion.obstacles.obstacle_sectors import ABOVE_M, BELOW_M
 
 CELL_RAD = np.radians(1.0)
 UP_RAD, DOWN_RAD = np.arctan([ABOVE_M / 3.0, BELOW_M / 3.0])

@@ -11,8 +11,8 @@ from enum import Enum
 
 import numpy as np
 
-from companion.estimation.checkpoint import Checkpoint
 from companion.estimation.odometry.innovation_gate import MAX_ACCELERATION_M_S2
+from companion.estimation.resumption.checkpoint import Checkpoint
 from companion.geometry.transforms import Array, Pose, angle_between
 from companion.messages import Track
 from companion.slam.loop.relocalizer import MIN_FOUND

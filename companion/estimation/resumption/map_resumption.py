@@ -5,10 +5,10 @@ from __future__ import annotations
 from companion.config import FeaturesConfig
 from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.camera_motion import CameraMotion
-from companion.estimation.checkpoint import MAX_BYTES, Checkpoint
 from companion.estimation.georeference.segment_georeference import SegmentGeoreferences
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
-from companion.estimation.resumption import Resumption, Verdict
+from companion.estimation.resumption.checkpoint import MAX_BYTES, Checkpoint
+from companion.estimation.resumption.map_verification import Resumption, Verdict
 from companion.geometry.camera import Camera
 from companion.messages import TrackState, Warned
 from companion.slam.map.map_part import map_of, part_around

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.dense.obstacle_space import N_CELLS, cells_of, cells_with, nearest_in_cells
 from companion.geometry.transforms import (
     Array,
     Pose,
     quaternion_from_euler,
     rotation_from_quaternion,
 )
+from companion.obstacles.obstacle_space import N_CELLS, cells_of, cells_with, nearest_in_cells
 
 PLACE = np.array([103.0, -57.0, -12.0])
 EVERYWHERE = np.ones(N_CELLS, bool)

@@ -11,21 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.dense.clear_sight import free_sectors
-from companion.dense.fresh_sight import points_found, rays_of, sectors_seen
-from companion.dense.newest_sight import NewestSight, Seen, things_in
-from companion.dense.obstacle_space import cells_with, nearest_in_cells
-from companion.dense.obstacles import (
-    FREE_M,
-    MIN_POINTS,
-    N_SECTORS,
-    Obstacles,
-    RecentCloud,
-    known_in,
-    obstacles_around,
-    sector_of,
-)
-from companion.dense.sight_tracks import WINDOW_PX
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import (
@@ -38,6 +23,21 @@ from companion.messages import (
     Track,
     TrackState,
 )
+from companion.obstacles.clear_sight import free_sectors
+from companion.obstacles.fresh_sight import points_found, rays_of, sectors_seen
+from companion.obstacles.newest_sight import NewestSight, Seen, things_in
+from companion.obstacles.obstacle_sectors import (
+    FREE_M,
+    MIN_POINTS,
+    N_SECTORS,
+    Obstacles,
+    known_in,
+    obstacles_around,
+    sector_of,
+)
+from companion.obstacles.obstacle_space import cells_with, nearest_in_cells
+from companion.obstacles.recent_cloud import RecentCloud
+from companion.obstacles.sight_tracks import WINDOW_PX
 
 MAX_AGE_NS = 200_000_000
 """Age of the image that the pose is from, and of that in which a sector was seen, since exposure;
@@ -130,7 +130,7 @@ class ObstacleFinder:
     def in_space(self, now_ns: int) -> Array | None:
         """The nearest obstacle (N, 3) in each part of the space around, metres, in body axes.
 
-        None while the pose is unknown or old. See `companion.dense.obstacle_space`.
+        None while the pose is unknown or old. See `companion.obstacles.obstacle_space`.
         """
         known = self._known(now_ns)
         if known is None:

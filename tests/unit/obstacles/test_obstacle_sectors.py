@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.dense.obstacles import N_SECTORS, UNKNOWN_CM, RecentCloud, obstacles_around
 from companion.geometry.transforms import (
     Array,
     Pose,
@@ -18,6 +17,8 @@ from companion.geometry.transforms import (
     rotation_from_vector,
 )
 from companion.messages import Georeference, MapUpdate, PointChunk
+from companion.obstacles.obstacle_sectors import N_SECTORS, UNKNOWN_CM, obstacles_around
+from companion.obstacles.recent_cloud import RecentCloud
 from drivers.mavlink.measurements.obstacle_distance import obstacle_distance
 
 PLACE = np.array([103.0, -57.0, -12.0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.estimation.tracking_margin import (
+from companion.estimation.odometry.tracking_margin import (
     AWAY,
     TOO_FAINT,
     TOO_FAST,

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.dense.obstacles import FREE_M, MAX_M
-from companion.dense.sight_depth import SightDepth, sight_depth
-from companion.dense.sight_tracks import MOST_IMAGES, SightTracks
-from companion.dense.sky import sky_rays
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Bytes, MapUpdate, Track
+from companion.obstacles.obstacle_sectors import FREE_M, MAX_M
+from companion.obstacles.sight_depth import SightDepth, sight_depth
+from companion.obstacles.sight_tracks import MOST_IMAGES, SightTracks
+from companion.obstacles.sky import sky_rays
 
 MAX_RELATIVE_SIGMA = 0.08
 """Of a depth that counts as known."""

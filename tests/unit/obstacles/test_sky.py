@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.dense.newest_sight import NEAR_BY_RAD
-from companion.dense.sky import sky_rays
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from companion.messages import Bytes
+from companion.obstacles.newest_sight import NEAR_BY_RAD
+from companion.obstacles.sky import sky_rays
 
 AHEAD = Pose(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.zeros(3))
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, body_from_camera=AHEAD)

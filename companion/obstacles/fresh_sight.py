@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.dense.obstacles import MIN_POINTS, N_SECTORS, sector_of
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Floats
+from companion.obstacles.obstacle_sectors import MIN_POINTS, N_SECTORS, sector_of
 
 Ints = NDArray[np.int64]
 

@@ -10,15 +10,12 @@ Static textured obstacles are detected; moving or untextured ones are not.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.dense.fusion import MAX_SIGMA, chunk_alone, measured_only
 from companion.geometry.transforms import Array, Pose
-from companion.messages import DepthMap, MapUpdate, PointChunk
 
 N_SECTORS = 72
 SECTOR_DEG = 5.0
@@ -31,8 +28,6 @@ FREE_M = 8.0
 """Distance up to which a sector is free; in straight flight more has no parallax ahead."""
 ABOVE_M, BELOW_M = 1.0, 0.75
 """Heights searched, relative to the vehicle, along the vertical."""
-STAYS_S = 15.0
-"""Age up to which an obstacle stays."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,52 +93,3 @@ def bearings_of(points: Array, world_from_body: Pose) -> Array:
     forward = world_from_body.rotation[:, 0]
     out: Array = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(forward[1], forward[0])
     return out
-
-
-class RecentCloud:
-    """The newest parts of the cloud, subsampled; older than `max_age_s` are ignored.
-
-    A depth map counts as it comes; its fused chunk, two keyframes later, replaces it.
-    """
-
-    def __init__(
-        self, max_age_s: float = STAYS_S, max_chunks: int = 12, max_points: int = 4000
-    ) -> None:
-        self._max_age_ns = round(max_age_s * 1e9)
-        self._max_chunks = max_chunks
-        self._max_points = max_points
-        self._chunks: OrderedDict[int, PointChunk] = OrderedDict()
-
-    def add_map(self, depth_map: DepthMap) -> None:
-        """Add what a depth map has measured for certain."""
-        self.add(chunk_alone(measured_only(depth_map, MAX_SIGMA)))
-
-    def add(self, chunk: PointChunk) -> None:
-        """Add a chunk, replacing one of the same keyframe."""
-        step = -(-len(chunk.points_camera) // self._max_points) or 1
-        thinned = PointChunk(
-            chunk.keyframe_id,
-            chunk.t_ns,
-            chunk.points_camera[::step],
-            chunk.rgb[::step],
-            chunk.confidence[::step],
-            chunk.normals_camera[::step],
-            chunk.sigma[::step],
-        )
-        self._chunks.pop(chunk.keyframe_id, None)
-        self._chunks[chunk.keyframe_id] = thinned
-        while len(self._chunks) > self._max_chunks:
-            self._chunks.popitem(last=False)
-
-    def in_world(self, t_ns: int, update: MapUpdate) -> Array | None:
-        """Points (N, 3), metres; None without a metric scale."""
-        if update.georeference is None:
-            return None
-        points = [np.zeros((0, 3))]
-        for chunk in self._chunks.values():
-            place = update.place_of(chunk.keyframe_id)
-            if place is None or t_ns - chunk.t_ns > self._max_age_ns:
-                continue
-            world_from_camera = update.georeference.world_from_map @ place
-            points.append(world_from_camera.apply(chunk.points_camera.astype(np.float64)))
-        return np.concatenate(points)

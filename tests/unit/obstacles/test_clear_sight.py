@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.dense.clear_sight import THING_M, free_sectors
-from companion.dense.newest_sight import Seen
-from companion.dense.obstacles import FREE_M
-from companion.dense.sight_tracks import WINDOW_PX
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
+from companion.obstacles.clear_sight import THING_M, free_sectors
+from companion.obstacles.newest_sight import Seen
+from companion.obstacles.obstacle_sectors import FREE_M
+from companion.obstacles.sight_tracks import WINDOW_PX
 from tests.support.flights.approach_scene import ApproachScene, Sheet
-from tests.unit.dense.test_newest_sight import AHEAD, SCENE, looked
+from tests.unit.obstacles.test_newest_sight import AHEAD, SCENE, looked
 
 EYE = np.array([3.0, -4.0, -10.0])
 HERE = Pose(np.eye(3), EYE)

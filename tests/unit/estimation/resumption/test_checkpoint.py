@@ -14,7 +14,9 @@ import pytest
 from companion.config import Config, FeedbackConfig, TelemetryConfig
 from companion.daemon.flights import kept_map_place
 from companion.daemon.flights.kept_map_place import kept_map_path
-from companion.estimation.checkpoint import (
+from companion.estimation.localisation import LocalisationStage
+from companion.estimation.odometry.odometry_frame import OdometryState
+from companion.estimation.resumption.checkpoint import (
     MAX_BYTES,
     Checkpoint,
     CheckpointError,
@@ -22,9 +24,7 @@ from companion.estimation.checkpoint import (
     encode,
     read_arrays,
 )
-from companion.estimation.localisation import LocalisationStage
-from companion.estimation.odometry.odometry_frame import OdometryState
-from companion.estimation.resumption import (
+from companion.estimation.resumption.map_verification import (
     MAX_ABSENT_NS,
     MIN_FRAMES,
     TIMEOUT_NS,

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.dense.newest_sight import Seen
-from companion.dense.obstacles import ABOVE_M, BELOW_M, FREE_M, N_SECTORS, bearings_of
 from companion.geometry.transforms import Array, Pose
+from companion.obstacles.newest_sight import Seen
+from companion.obstacles.obstacle_sectors import ABOVE_M, BELOW_M, FREE_M, N_SECTORS, bearings_of
 
 THING_M = 0.6
 """Width and height of what would be seen `FREE_M` away, whatever it looks like."""

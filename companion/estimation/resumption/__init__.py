@@ -1,0 +1,1 @@
+"""Maps of the process before: kept as checkpoints, recognised, gone on with."""
