@@ -222,8 +222,8 @@ ARDUPILOT_RULES = (
     Rule("VISO_POS_X", _same_as("INS_POS1_X"), OUR_BODY),
     Rule("VISO_POS_Y", _same_as("INS_POS1_Y"), OUR_BODY),
     Rule("VISO_POS_Z", _same_as("INS_POS1_Z"), OUR_BODY),
-    Rule("VISO_QUAL_MIN", _quality, "above feedback.min_quality our poses would be ignored; -1 "
-         "would take lost ones"),
+    Rule("VISO_QUAL_MIN", _quality, "above expert.feedback.min_quality our poses would be ignored; "
+         "-1 would take lost ones"),
     Rule("VISO_DELAY_MS", _viso_delay, "the time from exposure to sending, as measured; ArduPilot "
          "counts from arrival"),
     Rule("PRX1_TYPE", _for_obstacles(OneOf((2,))), "2 takes OBSTACLE_DISTANCE, which "
@@ -263,7 +263,7 @@ PX4_RULES = (
     Rule("EKF2_DELAY_MAX", _delay_max, "older poses than this are not fused; ours were measured "
          "to be that old", reboot=True),
     Rule("EKF2_EV_NOISE_MD", _always(OneOf((0,))), "1 would not use the uncertainty that we send"),
-    Rule("EKF2_EV_QMIN", _quality, "above feedback.min_quality our poses would be ignored"),
+    Rule("EKF2_EV_QMIN", _quality, "above expert.feedback.min_quality our poses would be ignored"),
     Rule("EKF2_EVP_NOISE", _least_noise(VELOCITY), "the least uncertainty that a position is taken "
          "to have: over known ground ours states less than the 0.1 m that PX4 begins with"),
     Rule("EKF2_EVV_NOISE", _least_noise("vision_position"), "the same of a velocity"),

@@ -162,7 +162,7 @@ def said(speed: Speed, profile: str) -> list[str]:
         wanted = depth_images_wanted(speed, MEASURED_STRIDE)
         lines += [
             f"  {speed.depth_device}: {speed.depth_images_per_s:.0f} images/s at"
-            f" depth.stride = {MEASURED_STRIDE}; the sample flight wants {wanted:.0f}"
+            f" expert.depth.stride = {MEASURED_STRIDE}; the sample flight wants {wanted:.0f}"
         ]
     else:
         lines += ["  no OpenCL device that works: depth.enabled = false"]

@@ -17,7 +17,7 @@ class LinkConfig:
     url: str = ""
     """serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT; "" for none. Baud
     "auto" is detected."""
-    system_id: Annotated[int, Meta(ge=0, le=255)] = 0
+    system_id: Expert[Annotated[int, Meta(ge=0, le=255)]] = 0
     """MAVLink system id of the vehicle; 0 takes the first autopilot heard."""
     signing_key_file: str = ""
     """A file with 64 hexadecimal digits, to sign MAVLink; "" for unsigned."""
@@ -84,20 +84,20 @@ class FeedbackConfig:
     """Send latitude and longitude while satellites are not in use, and no pose is sent: sensor is
     GLOBAL_POSITION_SENSOR for PX4, estimate MAV_CMD_EXTERNAL_POSITION_ESTIMATE for ArduPilot,
     gps_input GPS_INPUT for others; see docs/global_position.md."""
-    rate_hz: Annotated[float, Meta(ge=4, le=100)] = 30.0
+    rate_hz: Expert[Annotated[float, Meta(ge=4, le=100)]] = 30.0
     """Least rate of poses, Hz; between frames they are predicted."""
-    max_sigma_m: Annotated[float, Meta(ge=0.01, le=100)] = 1.0
+    max_sigma_m: Expert[Annotated[float, Meta(ge=0.01, le=100)]] = 1.0
     """Positions with a larger standard deviation are not sent, metres."""
-    min_quality: Annotated[int, Meta(ge=1, le=100)] = 20
+    min_quality: Expert[Annotated[int, Meta(ge=1, le=100)]] = 20
     """Poses of a lower quality are not sent."""
-    max_gap_ms: Annotated[float, Meta(ge=30, le=300)] = 200.0
+    max_gap_ms: Expert[Annotated[float, Meta(ge=30, le=300)]] = 200.0
     """Longest prediction after the frame that a pose is from, milliseconds."""
-    resume_after_s: Annotated[float, Meta(ge=0.1, le=60)] = 1.0
+    resume_after_s: Expert[Annotated[float, Meta(ge=0.1, le=60)]] = 1.0
     """The gate must have accepted poses for this long before they are sent again, seconds; after
     frames that were missing for a shorter time, and of which none was refused, for that time."""
-    max_jump_m: Annotated[float, Meta(ge=0.05, le=100)] = 1.0
+    max_jump_m: Expert[Annotated[float, Meta(ge=0.05, le=100)]] = 1.0
     """Largest innovation of a pose against the predicted motion, metres; beyond, it is a reset."""
-    set_origin: bool = True
+    set_origin: Expert[bool] = True
     """Set an origin on an autopilot that has none, so that it can use a pose."""
     origin_latitude_deg: Annotated[float, Meta(ge=-90, le=90)] = 0.0
     """Latitude of that origin where no GPS has given one, degrees."""
@@ -144,9 +144,9 @@ class GpsConfig:
 
     switch_source: bool = False
     """Switch ArduPilot's EKF to other sources while satellites are doubted and poses are sent."""
-    vision_set: Annotated[int, Meta(ge=1, le=3)] = 2
+    vision_set: Expert[Annotated[int, Meta(ge=1, le=3)]] = 2
     """Source set (EK3_SRC2_… is 2) without satellites, switched to when they are doubted."""
-    satellites_set: Annotated[int, Meta(ge=1, le=3)] = 1
+    satellites_set: Expert[Annotated[int, Meta(ge=1, le=3)]] = 1
     """Source set with satellites, switched back to when they agree again."""
 
 

@@ -33,9 +33,9 @@ class CameraConfig:
     exposure: Literal["camera", "tracking"] = "camera"
     """v4l2: tracking chooses exposure and gain so that motion blurs by 1.5 pixels at most; camera
     leaves them to it, but for exposure_us and gain."""
-    exposure_us: Annotated[int, Meta(ge=0, le=1000000)] = 0
+    exposure_us: Expert[Annotated[int, Meta(ge=0, le=1000000)]] = 0
     """v4l2: exposure time, microseconds; 0 leaves it to the camera."""
-    stamp_offset_ms: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0
+    stamp_offset_ms: Expert[Annotated[float, Meta(ge=-1000, le=1000)]] = 0.0
     """Added to stamps, milliseconds: from the source's stamp to mid-exposure."""
     calibration: str = ""
     """Calibration file of a live camera, as `companion calibrate` writes it."""
@@ -71,9 +71,9 @@ class MountConfig:
 
     type: Literal["fixed", "gimbal"] = "fixed"
     """gimbal: its angles come with telemetry, and poses are sent only while they are known."""
-    gimbal_delay_ms: Annotated[float, Meta(ge=-500, le=500)] = 0.0
+    gimbal_delay_ms: Expert[Annotated[float, Meta(ge=-500, le=500)]] = 0.0
     """Delay of the stamps of the gimbal's angles, milliseconds: where its estimate begins."""
-    gimbal_sigma_deg: Annotated[float, Meta(ge=0.01, le=30)] = 1.0
+    gimbal_sigma_deg: Expert[Annotated[float, Meta(ge=0.01, le=30)]] = 1.0
     """One standard deviation of the gimbal's angles, degrees."""
     known: bool = False
     """The angles below are those of the camera; else the autopilot's attitude cannot be used."""

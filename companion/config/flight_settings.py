@@ -21,7 +21,7 @@ class DaemonConfig:
     ends."""
     viewer: str = "none"
     """none, web, native, or the rerun+http://… of a running viewer."""
-    hot_c: Annotated[float, Meta(ge=30, le=120)] = 85.0
+    hot_c: Expert[Annotated[float, Meta(ge=30, le=120)]] = 85.0
     """Temperature of the processor above which the load level is reduced, Celsius."""
     missing_device_s: Expert[Annotated[float, Meta(ge=0, le=3600)]] = 60.0
     """Seconds after which a missing camera or autopilot ends the daemon, unless armed; 0: never."""
@@ -41,7 +41,7 @@ class RecorderConfig:
     """Record live flights."""
     codec: Literal["mjpeg", "h264", "png", "raw"] = "mjpeg"
     """Image codec; h264 is smaller and more work, png and raw are lossless."""
-    least_free_mb: Annotated[int, Meta(ge=0, le=1000000)] = 1000
+    least_free_mb: Expert[Annotated[int, Meta(ge=0, le=1000000)]] = 1000
     """Least free disk space, megabytes; below it the oldest flights are deleted, but those with a
     file named keep."""
     when_full: Expert[Literal["prune", "stop"]] = "prune"

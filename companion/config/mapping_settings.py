@@ -58,7 +58,7 @@ class DepthConfig:
 
     enabled: bool = True
     """Make the dense map; without it there are a trajectory and sparse points only."""
-    stride: Annotated[int, Meta(ge=1, le=8)] = 2
+    stride: Expert[Annotated[int, Meta(ge=1, le=8)]] = 2
     """Pixel step of depth estimation; images are matched at full size."""
     reference_step: Expert[Annotated[float, Meta(ge=0, le=10)]] = 0.15
     """Least distance between keyframes with a depth map, as a share of the depth."""

@@ -25,9 +25,9 @@ class StreamConfig:
 
     listen: Address = "127.0.0.1:9870"
     """HOST:PORT at which viewers connect; "" for none. 0.0.0.0 is every network."""
-    budget_kbit_s: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
+    budget_kbit_s: Expert[Annotated[float, Meta(ge=0, le=1e6)]] = 0.0
     """Rate limit of all viewers together, kbit/s; 0: as much as the link carries."""
-    web_bind: str = "127.0.0.1"
+    web_bind: Expert[str] = "127.0.0.1"
     """Address of the page of daemon.viewer = "web", ports 9090 and 9876; 0.0.0.0: all networks."""
     most_viewers: Expert[Annotated[int, Meta(ge=1, le=16)]] = 4
     """Viewers at once."""
@@ -41,7 +41,7 @@ class VideoConfig:
 
     listen: Address = ""
     """HOST:PORT of an RTSP server, whose path is /camera; "" for none. 0.0.0.0 is every network."""
-    kbit_s: Annotated[int, Meta(ge=50, le=50000)] = 2000
+    kbit_s: Expert[Annotated[int, Meta(ge=50, le=50000)]] = 2000
     """Bit rate of the video, kbit/s."""
     overlay: tuple[Literal["points", "horizon", "depth"], ...] = ()
     """Drawn over the video, some of these: the points that are tracked, the horizon with the points
@@ -54,7 +54,7 @@ class DistributedConfig:
 
     enabled: bool = False
     """Publish the topics. Needs the extra of the same name."""
-    vehicle: str = "drone"
+    vehicle: Expert[str] = "drone"
     """Name of the drone in keys; nodes of one drone have the same."""
     listen: tuple[str, ...] = ()
     """Endpoints to listen at, as tcp/0.0.0.0:7447; none: loopback, if tracking runs here."""

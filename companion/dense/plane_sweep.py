@@ -49,7 +49,8 @@ class PlaneSweep:
         if 2 * PLANES[-1] * n > largest:
             raise DeviceError(
                 f"{device.name}: images of {width} x {height} need a buffer of "
-                f"{2 * PLANES[-1] * n >> 20} MB, it allows {largest >> 20}: raise depth.stride"
+                f"{2 * PLANES[-1] * n >> 20} MB, it allows {largest >> 20}: "
+                "raise expert.depth.stride"
             )
         self._kernels = {n: _kernels(device, n) for n in PLANES}
         self._n_pixels = width * height

@@ -15,7 +15,7 @@ class ArrivalClock:
     """Offset of the sender's clock by the least delayed arrivals: a delay only makes an image late.
 
     The delay common to all images (encoding, the network at its best) is not observable; that is
-    what `camera.stamp_offset_ms` is for.
+    what `expert.camera.stamp_offset_ms` is for.
     """
 
     def __init__(self) -> None:

@@ -47,14 +47,14 @@ def apply_controls(path: str, node: CaptureNode, config: CameraConfig) -> tuple[
     exposure_ns = 0
     if config.exposure == "tracking" and (config.exposure_us > 0 or config.gain >= 0):
         raise ConfigError(
-            'camera.exposure = "tracking" chooses exposure and gain: leave camera.exposure_us and '
-            "expert.camera.gain at their defaults"
+            'camera.exposure = "tracking" chooses exposure and gain: leave '
+            "expert.camera.exposure_us and expert.camera.gain at their defaults"
         )
     if config.exposure_us > 0:
         if v4l2.CID_EXPOSURE_AUTO in controls:
             node.set_control(v4l2.CID_EXPOSURE_AUTO, v4l2.EXPOSURE_MANUAL)
         steps = max(1, round(config.exposure_us / EXPOSURE_UNIT_US))
-        given = put("camera.exposure_us / 100", (v4l2.CID_EXPOSURE_ABSOLUTE,), steps)
+        given = put("expert.camera.exposure_us / 100", (v4l2.CID_EXPOSURE_ABSOLUTE,), steps)
         exposure_ns = given * EXPOSURE_UNIT_US * 1_000
     if config.gain >= 0:
         if v4l2.CID_AUTOGAIN in controls:

@@ -120,8 +120,9 @@ def decisions_of(recording: Recording) -> Decisions:
     if toml is None:
         raise FlightError(f"{recording.path}: the configuration of the flight is not in it")
     name = recording.found.metadata.get(NOTES, {}).get("pictures", "")
-    found = Decisions(config_of_text(toml.decode(), f"{recording.path}: {CONFIG_TOML}"),
-                      name in LOSSLESS)  # fmt: skip
+    where = f"{recording.path}: {CONFIG_TOML}"
+    config = config_of_text(toml.decode(), where, lambda _: None)  # nobody renames its keys
+    found = Decisions(config, name in LOSSLESS)
     stream = MavlinkStream()
     take: dict[str, Callable[[int, bytes], None]] = {
         TRACKING: lambda t_ns, data: found.frames.append(_of(FrameTracked, t_ns, data)),

@@ -39,8 +39,8 @@ class RosTopics:
     def __init__(self, bus: ZenohBus, domain: int, vehicle: str) -> None:
         if not NAME.fullmatch(vehicle):
             raise InputError(
-                f"distributed.vehicle = {vehicle!r}: in a name of ROS are letters, digits and _ "
-                "only, no digit first"
+                f"expert.distributed.vehicle = {vehicle!r}: in a name of ROS are letters, digits "
+                "and _ only, no digit first"
             )
         self._bus = bus
         self._publishers: dict[str, _Publisher] = {}

@@ -113,7 +113,7 @@ def key_prefix(config: DistributedConfig) -> str:
     """Prefix of all keys of a vehicle; InputError for an invalid name."""
     if not NAME.fullmatch(config.vehicle):
         raise InputError(
-            f"distributed.vehicle = {config.vehicle!r}: wanted letters, digits, _ . - only"
+            f"expert.distributed.vehicle = {config.vehicle!r}: wanted letters, digits, _ . - only"
         )
     return f"companion/{config.vehicle}"
 

@@ -28,7 +28,7 @@ WALL_S, STOPPED_M_S = 25.0, 0.1
 BEFORE_A_WALL = Conditions(
     wind_m_s=0.0, pitch_deg=-20.0, landmarks=f"wall:{WALL_NORTH_M:g}", has_depth=True,
     parameters={"PRX1_TYPE": 2, "PRX_FILT": 0, "AVOID_ENABLE": 7},
-    settings=("feedback.obstacle_distance=true", "depth.stride=4"),
+    settings=("feedback.obstacle_distance=true", "expert.depth.stride=4"),
 )  # fmt: skip
 OWN_SOURCES = {
     "VISO_TYPE": 1, "VISO_DELAY_MS": 62, "EK3_SRC1_POSXY": 3, "EK3_SRC1_VELXY": 3,

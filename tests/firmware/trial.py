@@ -206,7 +206,7 @@ class Trial:
         home, c = self.firmware.home, self.conditions
         return [
             "camera.source=network", f"camera.url=tcp://127.0.0.1:{self._video_port}",
-            f"camera.rate_hz={CAMERA_HZ:g}", f"camera.stamp_offset_ms={-LATENCY_MS - 1:g}",
+            f"camera.rate_hz={CAMERA_HZ:g}", f"expert.camera.stamp_offset_ms={-LATENCY_MS - 1:g}",
             f"camera.calibration={self.folder / 'lens.toml'}",
             "mount.known=true", f"mount.pitch_deg={c.pitch_deg:g}",
             f"link.url=udpin:127.0.0.1:{self._companion_port}", f"expert.link.backend={c.backend}",

@@ -84,7 +84,7 @@ def test_limits_wait_for_disarming(tmp_path: Path) -> None:
         config.write_text("[feedback]\nmin_quality = 5\nmax_sigma_m = 0.5\nmax_jump_m = 9.0\n")
         flying.daemon.send(signal.SIGHUP)
         line = flying.daemon.line("looser and wait for disarming").text
-        assert "feedback.min_quality" in line and "feedback.max_jump_m" in line
+        assert "expert.feedback.min_quality" in line and "expert.feedback.max_jump_m" in line
         assert "max_sigma_m" not in line
         flying.until_told("limits", flying.daemon.started_ns)
 

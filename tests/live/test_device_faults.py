@@ -26,7 +26,9 @@ def test_in_flight_the_next_device_takes_over_and_the_pose_goes_on(
     first, second = two_devices(monkeypatch, tmp_path)
     now = tmp_path / "now"
     fail(monkeypatch, tmp_path, "abort", first, when=now)
-    with Flying(tmp_path, "depth.enabled=true", "depth.stride=4", program=UNGOVERNED) as flying:
+    with Flying(
+        tmp_path, "depth.enabled=true", "expert.depth.stride=4", program=UNGOVERNED
+    ) as flying:
         flying.until_source("camera", "running")
         flying.until_source("autopilot", "running")
         flying.autopilot.arm()

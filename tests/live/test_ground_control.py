@@ -51,8 +51,8 @@ def flying(folder: Path, port: int) -> Iterator[Flying]:
     settings = (
         f'router.clients=["tcpin:127.0.0.1:{port}"]',
         f"stream.listen=127.0.0.1:{free_port(socket.SOCK_STREAM)}",
-        f"control.keep={folder}/kept.toml", "depth.enabled=true", "depth.stride=8",
-        "feedback.min_quality=15", "expert.features.n_features=500",
+        f"control.keep={folder}/kept.toml", "depth.enabled=true", "expert.depth.stride=8",
+        "expert.feedback.min_quality=15", "expert.features.n_features=500",
     )  # fmt: skip
     dark = Flying(folder, *settings, program=UNGOVERNED)
     dark.camera.covered = True
@@ -83,7 +83,7 @@ def test_before_take_off(flying: Flying, ground: GroundStation) -> None:
     assert (found["FB_MODE"], found["FB_MIN_QUALITY"], found["MAP_STRIDE"]) == (1.0, 15.0, 8.0)
     assert ground.set("FB_MIN_QUALITY", 20.0) == 20.0
     health = flying.daemon.until(
-        lambda health: health["set_by_ground"] == {"feedback.min_quality": 20}, "set"
+        lambda health: health["set_by_ground"] == {"expert.feedback.min_quality": 20}, "set"
     )
     assert health["feedback"]["mode"] == "odometry"
     table = subprocess.run(
@@ -91,8 +91,8 @@ def test_before_take_off(flying: Flying, ground: GroundStation) -> None:
          "--set", f"expert.daemon.socket={flying.daemon.socket}"],
         capture_output=True, text=True, check=True, timeout=30,
     ).stdout  # fmt: skip
-    assert "feedback.min_quality = 20 (by the ground)" in table
-    flying.daemon.line("ground: feedback.min_quality = 20")
+    assert "expert.feedback.min_quality = 20 (by the ground)" in table
+    flying.daemon.line("ground: expert.feedback.min_quality = 20")
     kept = flying.daemon.folder / "kept.toml"
     flying.daemon.until(lambda _: kept.exists() and "min_quality = 20" in kept.read_text(), "kept")
     assert ground.set("FB_MIN_QUALITY", 1000.0) == 20.0
@@ -150,7 +150,7 @@ def test_viewers_have_a_budget(flying: Flying, ground: GroundStation) -> None:
     flying.until_stage("viewers", lambda found: "budget 300 kbit/s" in found["detail"])
     assert ground.command(BUDGET, -5.0) == [DENIED]
     flying.daemon.until(
-        lambda health: health["set_by_ground"].get("stream.budget_kbit_s") == 300.0, "told"
+        lambda health: health["set_by_ground"].get("expert.stream.budget_kbit_s") == 300.0, "told"
     )
 
 

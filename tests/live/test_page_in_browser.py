@@ -140,19 +140,19 @@ def test_parameters_are_set_by_buttons(page: Any, paged: Paged) -> None:
 
 
 def test_a_setting_is_changed_refused_and_undone(page: Any, paged: Paged, browser: Browser) -> None:
-    go(page, paged, "/settings#feedback.max_sigma_m")
-    field = page.get_by_label("feedback.max_sigma_m")
+    go(page, paged, "/settings?expert=1#expert.feedback.max_sigma_m")
+    field = page.get_by_label("expert.feedback.max_sigma_m")
     field.fill("a lot")
     press(page, "Save [feedback]")
     assert "1 value is not possible" in page.get_by_role("alert").inner_text()
     expect_refusal(browser, 422)
-    page.get_by_label("feedback.max_sigma_m").fill("0.5")
+    page.get_by_label("expert.feedback.max_sigma_m").fill("0.5")
     press(page, "Save [feedback]")
-    assert note(page) == "Changed: feedback.max_sigma_m is now 0.5."
+    assert note(page) == "Changed: expert.feedback.max_sigma_m is now 0.5."
     assert load_config(paged.config).feedback.max_sigma_m == 0.5
     paged.daemon.line("configuration read again")
-    page.get_by_role("button", name="Undo the change of feedback.max_sigma_m").first.click()
-    assert note(page) == "Changed: feedback.max_sigma_m is now the default."
+    page.get_by_role("button", name="Undo the change of expert.feedback.max_sigma_m").first.click()
+    assert note(page) == "Changed: expert.feedback.max_sigma_m is now the default."
 
 
 def test_it_is_ready_and_flies(page: Any, paged: Paged) -> None:

@@ -33,7 +33,7 @@ from tests.support.processes.strain import Strain
 
 SETTINGS = (
     "camera.source=pattern", "camera.rate_hz=15", "camera.width=320", "camera.height=240",
-    "depth.enabled=false", "daemon.flight=always", "recorder.least_free_mb=0",
+    "depth.enabled=false", "daemon.flight=always", "expert.recorder.least_free_mb=0",
 )  # fmt: skip
 OLDER_S = 1.0
 """What is older than this when all is killed is on the disk."""

@@ -35,7 +35,7 @@ repeat = true
 url = "udpin:127.0.0.1:14550"
 [daemon]
 flight = "always"
-[recorder]
+[expert.recorder]
 least_free_mb = 100
 """
 AUTOPILOT = """

@@ -45,15 +45,15 @@ WHILE_ARMED: Mapping[str, MayChange] = {
     "feedback.mode": _to_off,
     "feedback.global_position": _to_off,
     # how often, not what is believed; every value that it can have is one that autopilots take
-    "feedback.rate_hz": _freely,
-    "feedback.max_sigma_m": _to_less,
-    "feedback.min_quality": _to_more,
-    "feedback.max_gap_ms": _to_less,
-    "feedback.resume_after_s": _to_more,
+    "expert.feedback.rate_hz": _freely,
+    "expert.feedback.max_sigma_m": _to_less,
+    "expert.feedback.min_quality": _to_more,
+    "expert.feedback.max_gap_ms": _to_less,
+    "expert.feedback.resume_after_s": _to_more,
     # what is further away than this is announced as a reset; a smaller one is announced sooner
-    "feedback.max_jump_m": _to_less,
+    "expert.feedback.max_jump_m": _to_less,
     # an origin that is given in the air moves what the autopilot takes for its place
-    "feedback.set_origin": _not_at_all,
+    "expert.feedback.set_origin": _not_at_all,
     "feedback.origin_latitude_deg": _not_at_all,
     "feedback.origin_longitude_deg": _not_at_all,
     "feedback.origin_altitude_m": _not_at_all,

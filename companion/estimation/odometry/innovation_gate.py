@@ -11,8 +11,8 @@ from companion.geometry.transforms import Array
 MAX_ACCELERATION_M_S2 = 4.0
 MIN_CONSISTENT_NS, MIN_CONSISTENT_FRAMES = 500_000_000, 3
 """Positions outside the gate are accepted, as a reset, after agreeing with each other for so long:
-longer than any gap bridged (feedback.max_gap_ms is at most 300), at any frame rate; and never with
-fewer frames."""
+longer than any gap bridged (expert.feedback.max_gap_ms is at most 300), at any frame rate; and
+never with fewer frames."""
 
 
 class _Refused(NamedTuple):

@@ -19,13 +19,13 @@ from drivers.system.serial_devices import serial_devices
 
 NEEDED = {
     "camera": ("camera.source", "camera.device", "camera.url", "camera.width", "camera.height",
-               "camera.rate_hz", "camera.exposure_us"),
+               "camera.rate_hz"),
     "lens": ("camera.calibration", "camera.assumed_hfov_deg"),
     "mount": ("mount.known", "mount.roll_deg", "mount.pitch_deg", "mount.yaw_deg", "mount.x_m",
               "mount.y_m", "mount.z_m"),
-    "autopilot": ("link.url", "link.system_id"),
-    "place": ("feedback.set_origin", "feedback.origin_latitude_deg",
-              "feedback.origin_longitude_deg", "feedback.origin_altitude_m"),
+    "autopilot": ("link.url",),
+    "place": ("feedback.origin_latitude_deg", "feedback.origin_longitude_deg",
+              "feedback.origin_altitude_m"),
     "ready": ("feedback.mode", "daemon.flight"),
 }  # fmt: skip
 """Settings of each step."""

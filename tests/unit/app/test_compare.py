@@ -80,7 +80,7 @@ def test_settings_of_the_version_before_are_compared_by_their_keys_now(tmp_path:
         (folder / "report.json").write_text(json.dumps(report | {"config": settings}))
     assert compared(a, b, "--out", tmp_path / "out") == 0
     told = json.loads((tmp_path / "out" / "compare.json").read_text())
-    assert told["config"] == {"depth.stride": [None, 1], "mapping.window": [5, None]}
+    assert told["config"] == {"expert.depth.stride": [None, 1], "mapping.window": [5, None]}
 
 
 def test_limits_that_are_not_kept_fail(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

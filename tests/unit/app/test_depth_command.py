@@ -170,7 +170,7 @@ def test_a_frame_that_is_not_there_is_told_with_those_that_are(
 def test_depth_is_written(rendered: list[tuple[Bytes, Floats]], tmp_path: Path) -> None:
     write_posed_video(tmp_path / "set", rendered)
     out = tmp_path / "out"
-    command = ["depth", str(tmp_path / "set"), "--out", str(out), "--set", "depth.stride=1"]
+    command = ["depth", str(tmp_path / "set"), "--out", str(out), "--set", "expert.depth.stride=1"]
     assert main([*command, "--reference", "4"]) == 0
     with np.load(out / "depth_000004.npz") as written:
         depth, state, sigma = written["depth_m"], written["state"], written["sigma_m"]

@@ -73,14 +73,16 @@ def test_off_stays_off_over_a_crash_until_disarming(autopilot: Autopilot, tmp_pa
 def test_limits_made_stricter_stay_and_looser_ones_wait(
     autopilot: Autopilot, tmp_path: Path
 ) -> None:
-    in_flight(autopilot, tmp_path, {"feedback.max_sigma_m": 0.5})
-    loosened = with_values(READ, {"feedback.min_quality": 5, "feedback.max_gap_ms": 100.0})
+    in_flight(autopilot, tmp_path, {"expert.feedback.max_sigma_m": 0.5})
+    loosened = with_values(
+        READ, {"expert.feedback.min_quality": 5, "expert.feedback.max_gap_ms": 100.0}
+    )
     after, file = autopilot.arming(tmp_path, loosened)
     found = after.resume(loosened)
     assert found.config == with_values(
-        READ, {"feedback.max_sigma_m": 0.5, "feedback.max_gap_ms": 100.0}
+        READ, {"expert.feedback.max_sigma_m": 0.5, "expert.feedback.max_gap_ms": 100.0}
     )
-    assert found.waiting == {"feedback.min_quality": 5}
+    assert found.waiting == {"expert.feedback.min_quality": 5}
     file.close(0.0)
 
 

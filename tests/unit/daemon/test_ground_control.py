@@ -193,7 +193,8 @@ def test_what_the_ground_has_set_is_kept_if_the_configuration_says_so(tmp_path: 
     kept, changed = kept_over(loader(config))
     assert to_toml(kept) == to_toml(daemon.config)
     assert changed == {
-        "feedback.mode": "vision_position", "depth.enabled": False, "stream.budget_kbit_s": 400.0,
+        "feedback.mode": "vision_position", "depth.enabled": False,
+        "expert.stream.budget_kbit_s": 400.0,
     }  # fmt: skip
     without, _, _ = control_of(Config())
     without.set("MAP_DENSE", 0.0)
@@ -211,7 +212,9 @@ def test_a_kept_file_of_the_version_before_counts(
     assert "features.n_features is now expert.features.n_features" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("text", ["link.url = 'x'", "depth.stride = 99", "depth.strid = 1", "?"])
+@pytest.mark.parametrize(
+    "text", ["link.url = 'x'", "expert.depth.stride = 99", "depth.strid = 1", "?"]
+)
 def test_a_kept_file_that_no_ground_has_written_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "kept.toml"
     path.write_text(text)

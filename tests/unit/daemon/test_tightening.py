@@ -26,23 +26,24 @@ FLYING = Config(
 )
 TIGHTER: dict[str, Any] = {
     "feedback.mode": "off", "feedback.global_position": "off", "feedback.flow": "off",
-    "feedback.max_sigma_m": 0.5,
-    "feedback.min_quality": 40, "feedback.max_gap_ms": 100.0, "feedback.resume_after_s": 2.0,
-    "feedback.max_jump_m": 0.5,
+    "expert.feedback.max_sigma_m": 0.5,
+    "expert.feedback.min_quality": 40, "expert.feedback.max_gap_ms": 100.0,
+    "expert.feedback.resume_after_s": 2.0, "expert.feedback.max_jump_m": 0.5,
     "expert.georeference.min_travel_m": 6.0, "expert.georeference.max_sigma_scale": 0.05,
     "expert.tracking.min_inliers": 30, "telemetry.use": ("attitude",),
 }  # fmt: skip
 LOOSER: dict[str, Any] = {
     "feedback.mode": "vision_position", "feedback.global_position": "gps_input",
     "feedback.flow": "optical_flow_rad",
-    "feedback.max_sigma_m": 2.0, "feedback.min_quality": 10,
-    "feedback.max_gap_ms": 300.0, "feedback.resume_after_s": 0.5, "feedback.max_jump_m": 2.0,
+    "expert.feedback.max_sigma_m": 2.0, "expert.feedback.min_quality": 10,
+    "expert.feedback.max_gap_ms": 300.0, "expert.feedback.resume_after_s": 0.5,
+    "expert.feedback.max_jump_m": 2.0,
     "expert.georeference.min_travel_m": 1.0, "expert.georeference.max_sigma_scale": 0.3,
     "expert.tracking.min_inliers": 10, "telemetry.use": ("imu", "attitude", "satellites"),
 }  # fmt: skip
-FREE = {"feedback.rate_hz": 60.0}
+FREE = {"expert.feedback.rate_hz": 60.0}
 FIXED: dict[str, Any] = {
-    "feedback.set_origin": False, "feedback.origin_latitude_deg": 47.0,
+    "expert.feedback.set_origin": False, "feedback.origin_latitude_deg": 47.0,
     "feedback.origin_longitude_deg": 8.0, "feedback.origin_altitude_m": 400.0,
     "feedback.obstacle_distance": True,
     "feedback.obstacles_3d": True,
@@ -51,7 +52,8 @@ FIXED: dict[str, Any] = {
 
 def test_each_key_of_feedback_is_in_the_table() -> None:
     keys = {f"feedback.{each.name}" for each in dataclasses.fields(FeedbackConfig)}
-    assert {name for name in WHILE_ARMED if name.startswith("feedback.")} == keys
+    ruled = {name.removeprefix("expert.") for name in WHILE_ARMED if "feedback." in name}
+    assert ruled == keys
     assert {*TIGHTER, *FREE, *FIXED} == {*LOOSER, *FREE, *FIXED} == set(WHILE_ARMED)
 
 
@@ -71,10 +73,10 @@ def test_each_key_goes_one_way(name: str) -> None:
 
 @pytest.mark.parametrize("name", sorted({*LOOSER, *FIXED}))
 def test_what_is_read_again_waits_where_it_is_looser(name: str) -> None:
-    wanted = with_values(FLYING, {name: (LOOSER | FIXED)[name], "depth.stride": 4})
+    wanted = with_values(FLYING, {name: (LOOSER | FIXED)[name], "expert.depth.stride": 4})
     going_on, waiting = tightened(FLYING, wanted)
     assert waiting == {name: (LOOSER | FIXED)[name]}
-    assert going_on == with_values(FLYING, {"depth.stride": 4})
+    assert going_on == with_values(FLYING, {"expert.depth.stride": 4})
     assert with_values(going_on, waiting) == wanted
 
 
@@ -87,10 +89,10 @@ def test_what_is_read_again_counts_where_it_is_tighter(name: str) -> None:
 @pytest.mark.parametrize("use", [(*FLYING.telemetry.use, "satellites"), ("attitude",)])
 def test_what_is_believed_stays_as_at_the_start(use: tuple[Measurement, ...]) -> None:
     """Whether armed or not: one flight believes one list."""
-    read = with_values(FLYING, {"telemetry.use": use, "depth.stride": 4})
+    read = with_values(FLYING, {"telemetry.use": use, "expert.depth.stride": 4})
     config, cannot = reloaded(FLYING, read)
     assert cannot == ["telemetry.use"]
-    assert config == with_values(FLYING, {"depth.stride": 4})
+    assert config == with_values(FLYING, {"expert.depth.stride": 4})
 
 
 def test_feedback_that_is_off_stays_off() -> None:

@@ -48,7 +48,7 @@ def test_every_public_key_is_there_with_its_text_and_bounds(served: ServedPage) 
         assert f'name="{name}"' in (expert if name.startswith("expert.") else shown), name
     for it in settings("feedback", False):
         assert it.text.split(";")[0].split('"')[0][:40] in shown
-    assert "From 0.05 to 100; default" in shown
+    assert "From 0.001 to 100; default" in shown
 
 
 def test_passwords_are_not_shown(served: ServedPage) -> None:
@@ -59,9 +59,9 @@ def test_passwords_are_not_shown(served: ServedPage) -> None:
 def test_a_value_is_kept_and_the_daemon_told(
     served: ServedPage, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    answer = save(served, feedback__max_sigma_m="0.5", camera__width="640",
+    answer = save(served, expert__feedback__max_sigma_m="0.5", camera__width="640",
                   camera__url="rtsp://eye:***@10.0.0.2/live")  # fmt: skip
-    assert "feedback.max_sigma_m is now 0.5." in answer.text
+    assert "expert.feedback.max_sigma_m is now 0.5." in answer.text
     text = served.config.read_text()
     assert "# of this drone" in text and "# as it was calibrated" in text and "secret" in text
     assert load_config(served.config).feedback.max_sigma_m == 0.5
@@ -75,8 +75,8 @@ def test_a_key_that_counts_after_a_restart_says_so(served: ServedPage) -> None:
 
 
 @pytest.mark.parametrize("name, text, wanted", [
-    ("feedback.max_sigma_m", "0", "0.01"),
-    ("feedback.min_quality", "many", "int"),
+    ("expert.feedback.max_sigma_m", "0", "0.01"),
+    ("expert.feedback.min_quality", "many", "int"),
     ("feedback.mode", "on", "wanted one of off, odometry, vision_position, velocity"),
     ("telemetry.use", '["attitude", "attitude"]', "at most once"),
     ("telemetry.use", '["smell"]', "smell"),
