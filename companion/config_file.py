@@ -46,7 +46,9 @@ HIDDEN = "***"
 """Text in place of a password."""
 _PASSWORD = re.compile(r"(://[^:/@\s]*):[^/\s]+@")
 _PASSWORD_GIVEN = re.compile(
-    r"""\b(user-pw|proxy-pw|password|passwd|pwd|pass)=("[^"]*"|'[^']*'|[^\s&"'!]+)""", re.IGNORECASE
+    r"""\b(user-pw|proxy-pw|password|passwd|pwd|pass|passphrase|\w*token|\w*secret)="""
+    r"""("[^"]*"|'[^']*'|[^\s&"'!]+)""",
+    re.IGNORECASE,
 )
 """In a pipeline of GStreamer, and in the query of a URL."""
 
@@ -226,15 +228,29 @@ def dump(config: Config) -> dict[str, Any]:
 
 
 def shown(config: Config) -> dict[str, Any]:
-    """The same as tables of tables, without the passwords of URLs."""
+    """The same as tables of tables, with passwords made unreadable."""
     out: dict[str, Any] = {}
-    for name, value in dump(config).items():
+    for name, value in dump(with_passwords_hidden(config)).items():
         *tables, key = name.split(".")
         table = out
         for each in tables:
             table = table.setdefault(each, {})
-        table[key] = without_passwords(value) if isinstance(value, str) else value
+        table[key] = value
     return out
+
+
+def with_passwords_hidden(config: Config) -> Config:
+    """The configuration with the passwords of URLs and pipelines made unreadable.
+
+    Before it is text: in TOML and JSON a quote within a value is another one.
+    """
+    return with_values(config, {name: _hidden(value) for name, value in dump(config).items()})
+
+
+def _hidden(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(_hidden, value))
+    return without_passwords(value) if isinstance(value, str) else value
 
 
 def without_passwords(text: str) -> str:

@@ -14,6 +14,7 @@ from importlib import metadata
 from pathlib import Path
 
 from companion import __version__
+from companion.app.doctor_command import doctor
 from companion.app.flights_command import list_flights, show_flight, trim_flight
 from companion.app.progress import Progress
 from companion.config import Config
@@ -86,7 +87,7 @@ def _contents(parts: Sequence[Part]) -> str:
     lines += [
         "",
         "Passwords of URLs are made unreadable. Keys (MAVLink signing, pairing) are in no file.",
-        "Not wanted: leave a file out with `zip -d FILE NAME`, the recording with --seconds 0.",
+        "Not wanted: leave a file out with `zip -d FILE NAME`; pictures, with --seconds 0.",
     ]
     return "\n".join(lines) + "\n"
 
@@ -96,16 +97,22 @@ def _parts(config: Config, flights: Path, seconds: float) -> Iterator[Part]:
                "make of computer and system", _versions())  # fmt: skip
     settings = json.dumps(shown(config), indent=1, ensure_ascii=False).encode()
     yield Part("settings.json", "the configuration in use",
-               "addresses and names of devices", settings)  # fmt: skip
+               "addresses, names of devices and folders", settings)  # fmt: skip
     kept = config.control.keep
     yield _tried(
         Part("kept_parameters.toml", "what a ground station has set", "nothing else"),
         lambda: _file(Path(kept)) if kept else _none("control.keep names no file"),
     )
     yield _tried(
-        Part("status.json", "health of the running daemon", "where its flights lie"),
+        Part("parameters.txt", "what `companion doctor` says of the autopilot's parameters",
+             "make and firmware of the autopilot"),
+        lambda: _doctor(config),
+    )  # fmt: skip
+    yield _tried(
+        Part("status.json", "health of the running daemon",
+             "WHERE ON EARTH it flies, and where its flights lie"),
         lambda: json.dumps(ask_status(found_socket_path(config.daemon.socket)), indent=1).encode(),
-    )
+    )  # fmt: skip
     yield _tried(
         Part("journal.txt", f"the last {JOURNAL_LINES} lines of the service",
              "times of flights, name of the computer"),
@@ -177,6 +184,12 @@ def _file(path: Path) -> bytes:
     return path.read_bytes()
 
 
+def _doctor(config: Config) -> bytes:
+    said = io.StringIO()
+    doctor(config, out=said)
+    return said.getvalue().encode()
+
+
 def _journal() -> bytes:
     command = ["journalctl", "--unit", "companion", "--lines", str(JOURNAL_LINES), "--no-pager"]
     done = subprocess.run(
@@ -184,6 +197,8 @@ def _journal() -> bytes:
     )
     if done.returncode:
         _none((done.stderr.strip().splitlines() or ["journalctl failed"])[-1])
+    if not done.stdout.strip() or done.stdout.startswith("-- No entries"):
+        _none("the journal has no line of the service: is it run by hand?")
     return without_passwords(done.stdout).encode()
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from companion.config import Config
-from companion.config_file import to_toml, without_passwords
+from companion.config_file import to_toml, with_passwords_hidden
 from companion.errors import StageError
 from companion.flight_notes import FlightNote, GateStep, HealthNote, LinkBytes
 from companion.geometry.camera import Camera
@@ -103,7 +103,7 @@ class Recorder:
             writer = McapWriter(files[0].append, PROFILE)
             self._channels = open_channels(writer)
             writer.attach(CAMERA_JSON, "application/json", camera_document(camera), 0)
-            toml = without_passwords(to_toml(config)).encode()
+            toml = to_toml(with_passwords_hidden(config)).encode()
             writer.attach(CONFIG_TOML, "application/toml", toml, 0)
             writer.note(NOTES, {**versions, "pictures": self._encoder.name, "flight": folder.name})
         except OSError as error:

@@ -16,6 +16,7 @@ from companion.config_file import (
     to_toml,
     value_of_key,
     values_in,
+    with_passwords_hidden,
     without_passwords,
 )
 from companion.errors import ConfigError
@@ -293,6 +294,8 @@ def test_passwords_are_not_shown() -> None:
     assert without_passwords("run --set camera.url=rtsp://a:b@c/") == (
         "run --set camera.url=rtsp://a:***@c/"
     )
+    joined = load_config(None, ['distributed.connect=["tls/10.0.0.2:7447?password=s3cret"]'])
+    assert shown(joined)["distributed"]["connect"] == ("tls/10.0.0.2:7447?password=***",)
 
 
 @pytest.mark.parametrize("text", [
@@ -300,11 +303,23 @@ def test_passwords_are_not_shown() -> None:
     "rtspsrc location=rtsp://10.0.0.2/ user-id=eye user-pw=s3cret ! rtph264depay",
     'rtspsrc user-pw="s3 cret" ! decodebin',
     "http://10.0.0.2/live?user=eye&password=s3cret&channel=1",
+    "srtsrc uri=srt://10.0.0.2:8890?mode=caller&passphrase=s3cret ! tsdemux",
+    "https://10.0.0.2/live?access_token=s3cret",
 ])  # fmt: skip
 def test_nor_are_those_of_pipelines_and_queries(text: str) -> None:
     seen = without_passwords(text)
     assert "cret" not in seen and "***" in seen
     assert "10.0.0.2" in seen or "10.0.0.2" not in text
+
+
+def test_a_file_without_passwords_is_read_back(tmp_path: Path) -> None:
+    """A quote within a value is written as two characters, which ends no password."""
+    pipeline = 'rtspsrc user-pw="s3 cret" user-id=eye ! decodebin'
+    config = load_config(None, [f"camera.pipeline={pipeline}"])
+    text = to_toml(with_passwords_hidden(config))
+    assert "cret" not in text
+    read = load_config(write(tmp_path, text))
+    assert read.camera.pipeline == "rtspsrc user-pw=*** user-id=eye ! decodebin"
 
 
 def test_a_command_is_shown_without_where_the_program_lies() -> None:

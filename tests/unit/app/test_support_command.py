@@ -62,6 +62,7 @@ def test_all_is_packed_and_told(
     assert files["README.txt"].decode().rstrip() in told
     for name in files:
         assert name in told or name == "README.txt"
+    assert "parameters.txt: not there: " in told  # link.url names no autopilot
     assert b"numpy " in files["versions.txt"]
     assert b"max_kbit_s = 400" in files["kept_parameters.toml"]
     assert b"2026-01-02T00-00-00Z" in files["flights.txt"]
