@@ -12,6 +12,9 @@ from companion.geometry.transforms import Array, Pose
 
 MAX_SIGMA_M = 5.0
 """Beyond, it is of no use even to find the map again."""
+CONTRADICTS_SIGMAS = 4.0
+"""Beyond, a map that is off from inertial navigation is wrong, not navigation; what that was off by
+without aid in the firmwares' simulators was 2.5 of them at most."""
 GOOD_SIGMA_M = 0.5
 """As long as it is this certain, it counts for more than a map that is poor."""
 
@@ -53,6 +56,14 @@ class Reckoning:
     def is_good(self) -> bool:
         """True where it counts for more than a map that is poor."""
         return self.reckoned is not None and self.reckoned.sigma_place_m < GOOD_SIGMA_M
+
+    def may_be_at(self, place_m: Array) -> bool:
+        """True where it may be off by the distance to a place (3,)."""
+        reckoned = self.reckoned
+        if reckoned is None:
+            return False
+        off_m = float(np.linalg.norm(place_m - reckoned.place_m))
+        return off_m < CONTRADICTS_SIGMAS * reckoned.sigma_place_m
 
     def clear(self) -> None:
         """Forget where it had the body."""

@@ -3,8 +3,7 @@
 Each must keep the rules (`pose_rules`). They must be kept for a while before the first pose is
 sent; gaps shorter than an autopilot's timeout are bridged by prediction, and longer ones by
 inertial dead reckoning for as long as its standard deviation is within the limit. After others, and
-after every discontinuity, the rules must be kept again: after a pause in which no frame came and
-none was refused for as long as the pause, after others for the whole time.
+after every discontinuity, the rules must be kept again, for a time that depends on why (`proof`).
 """
 
 from __future__ import annotations
@@ -28,21 +27,18 @@ from companion.estimation.gate.pose_rules import (
     sigma_place_m,
 )
 from companion.estimation.gate.pose_to_send import PoseToSend
+from companion.estimation.gate.proof import AS_RECKONED, SILENT, Proof, seen_as_reckoned
 from companion.estimation.gate.reset_counter import ResetCounter
 from companion.geometry.transforms import Pose
 from companion.messages import Odometry
 from companion.telemetry import AttitudeSample, is_believed
 
-MAX_PAUSE_NS = 3_000_000_000
-"""After frames that came too late, dead reckoning begins again within this time, with proof: a
-computer that was busy for a moment has lost nothing of where the body is."""
 MIN_SPACING_NS = 4_000_000
 N_PERIODS = 20
 MAX_ATTITUDE_GAP_NS = 2 * MAX_EXTRAPOLATION_NS
 """Between two attitude samples: no time is further from one than extrapolation reaches."""
 
 NOT_YET = "no pose yet"
-SILENT = "no frames"
 NOT_BELIEVED = "attitude is not believed"
 RESTARTED = "localisation begins anew"
 RESET = "position reset"
@@ -85,18 +81,14 @@ class PoseGate:
         self._start_down_m, self._may_start = start_down_m, may_start
         self._down_shift_m: float | None = None
         """Added to our down axis; fixed with the first pose, until a discontinuity."""
-        self._resets_seen: int | None = None
+        self._newest: Odometry | None = None
         self._accepted: Odometry | None = None
         self._held = HeldVelocity()
         self._accepted_at_ns = 0
-        self._accepted_since_ns: int | None = None
-        self._silent_since_ns: int | None = None
-        self._only_silent = False
-        """True where poses ceased for want of frames, and none was refused since."""
+        self._proof = Proof()
         self._last_stamp_ns = 0
         self._n_predicted = 0
         self._periods_ns: deque[int] = deque(maxlen=N_PERIODS)
-        self._newest_ns = 0
         self._last_rejection = ""
         self.state = Sending.OFF
         self.why_not = NOT_YET
@@ -113,13 +105,10 @@ class PoseGate:
 
     def restart(self) -> None:
         """Restart after a restart of localisation, whose poses are unrelated to earlier ones."""
-        if self.sending:
-            self._stop(RESTARTED)
+        self._stop(RESTARTED if self.sending else self.why_not)
         self._discontinuity()
-        self._resets_seen = None
-        self._accepted, self._accepted_since_ns = None, None
+        self._newest = self._accepted = None
         self._periods_ns.clear()
-        self._newest_ns = 0
 
     def autopilot_booted(self, last_sent: int | None) -> None:
         """Handle a boot of the autopilot: the reset counter last sent to it, None if none."""
@@ -148,23 +137,21 @@ class PoseGate:
 
     def take(self, odometry: Odometry, now_ns: int) -> PoseToSend | None:
         """Process the odometry of a frame; the pose to send at once, or None."""
-        if odometry.t_ns <= self._newest_ns:
+        before = self._newest
+        if before is not None and odometry.t_ns <= before.t_ns:
             return None
-        if self._newest_ns:
-            self._periods_ns.append(odometry.t_ns - self._newest_ns)
-        self._newest_ns = odometry.t_ns
-        was_reset = self._resets_seen not in (None, odometry.reset_counter)
-        self._resets_seen = odometry.reset_counter
-        if was_reset:
-            self._discontinuity()
-            self._stop(RESET)
-            return None
+        self._newest = odometry
+        as_reckoned = before is not None and seen_as_reckoned(before, odometry)
+        if before is not None:
+            self._periods_ns.append(odometry.t_ns - before.t_ns)
+            if odometry.reset_counter != before.reset_counter:
+                self._reset(as_reckoned)
+                return None
         if now_ns - self._accepted_at_ns > self._max_gap_ns:
             self._time_out()
         why_not = self._rejection_reason(odometry, now_ns)
         if why_not:
-            self._accepted_since_ns = None
-            self._only_silent = False
+            self._proof.refuse(why_not)
             if not self.sending:
                 self.state, self.why_not = Sending.OFF, why_not
             self._last_rejection = why_not
@@ -173,9 +160,8 @@ class PoseGate:
         self._held.take(odometry)
         self._last_rejection = ""
         if not self.sending:
-            if self._accepted_since_ns is None:
-                self._accepted_since_ns = now_ns
-            proven = now_ns - self._accepted_since_ns >= self._proof_ns(self._accepted_since_ns)
+            whole_ns = int(self._config.resume_after_s * 1e9)
+            proven = self._proof.keep(now_ns, whole_ns, as_reckoned)
             self.state = Sending.PROVING
             self.why_not = self._start_sending(odometry, now_ns) if proven else PROVING
             if self.why_not:
@@ -232,7 +218,7 @@ class PoseGate:
         """Reason why a pose is rejected; "" if accepted."""
         if "attitude" not in self._use:
             return NOT_BELIEVED
-        may_bridge = self.sending or self._paused_lately(now_ns)
+        may_bridge = self.sending or self._proof.paused_lately(now_ns)
         before = Before(self.sending, self._accepted is not None, may_bridge)
         attitude = self._attitude.at(odometry.t_ns)
         return rejection_reason(odometry, now_ns, attitude, before, self._config)
@@ -255,37 +241,28 @@ class PoseGate:
     def _discontinuity(self) -> None:
         self._counter.discontinuity()
         self._down_shift_m = None
-        self._only_silent = False
+
+    def _reset(self, as_reckoned: bool) -> None:
+        """Stop at a reset; where that only ends dead reckoning, heights stay those of before.
+
+        An autopilot's own height may have followed dead reckoning.
+        """
+        shift_m = self._down_shift_m
+        self._discontinuity()
+        self._down_shift_m = shift_m if as_reckoned else None
+        self._stop(RESET, AS_RECKONED if as_reckoned else "")
 
     def _time_out(self) -> None:
         """Stop sending: no pose was accepted for too long."""
-        if self.sending:
-            why_not = self._last_rejection or SILENT
-            self._stop(why_not)
-            if why_not == SILENT:
-                self._silent_since_ns, self._only_silent = self._accepted_at_ns, True
-        self._accepted_since_ns = None
+        if not self.sending:
+            self._proof.interrupt()
+            return
+        why_not = self._last_rejection or SILENT
+        self._stop(why_not, why_not, self._accepted_at_ns if why_not == SILENT else None)
 
-    def _stop(self, why_not: str) -> None:
+    def _stop(self, why_not: str, ceased: str = "", silent_since_ns: int | None = None) -> None:
         self.state, self.why_not = Sending.OFF, why_not
-        self._accepted_since_ns = self._silent_since_ns = None
-        self._only_silent = False
-
-    def _proof_ns(self, began_ns: int) -> int:
-        """Time for which the conditions must hold, since `began_ns`, before poses are sent.
-
-        A pause casts doubt on a pose that goes on without a discontinuity by what may have happened
-        in it: two frames lost at 10 frames/s are no reason to withhold a second of good ones.
-        """
-        whole_ns = int(self._config.resume_after_s * 1e9)
-        if self._silent_since_ns is None or not self._only_silent:
-            return whole_ns
-        return min(whole_ns, began_ns - self._silent_since_ns)
-
-    def _paused_lately(self, now_ns: int) -> bool:
-        """True where poses ceased for want of frames alone, and not long ago."""
-        since_ns = self._silent_since_ns
-        return since_ns is not None and now_ns - since_ns < MAX_PAUSE_NS
+        self._proof.begin_anew(ceased, silent_since_ns)
 
     def _pose_of(self, odometry: Odometry) -> PoseToSend:
         assert odometry.world_from_body is not None and odometry.velocity_world_m_s is not None

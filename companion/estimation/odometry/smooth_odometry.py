@@ -161,7 +161,8 @@ class SmoothOdometry:
         if self._stands(track.t_ns, flown.frame.from_world @ raw):
             self._aid(track.t_ns, flown.frame.from_world @ raw, georeference, noise_m)
             return course.none(Track(track.seq, track.t_ns, TrackState.LOST))
-        if course.dead_reckoning:
+        seen_again = course.dead_reckoning
+        if seen_again:
             self._starts.reacquire(raw, track.t_ns)
         frame, last = flown.frame, flown.last
         here = frame.from_world @ raw
@@ -177,7 +178,8 @@ class SmoothOdometry:
         within_gate = last is None or course.gate.reachable(
             last.place_m, placed.translation, track.t_ns - last.t_ns, course.velocity
         )
-        if not within_gate and not course.gate.agree(
+        as_reckoned = seen_again and self.reckoning.may_be_at(placed.translation)
+        if not (within_gate or as_reckoned) and not course.gate.agree(
             placed.translation, track.t_ns, course.velocity
         ):
             return course.reckoned(track)

@@ -292,6 +292,21 @@ def test_without_belief_in_the_attitude_nothing_is_sent(use: tuple[Measurement, 
     assert flight.run(3)
 
 
+@pytest.mark.parametrize(("doubt", "proof_s"), [({}, 0.3), ({"quality": 5}, 1.0)])
+def test_poses_go_on_soon_after_the_link_was_cut(doubt: dict[str, Any], proof_s: float) -> None:
+    """What could not be checked for a while was tracked all the time; else the proof is whole."""
+    flight = Flight()
+    flight.run(2)
+    flight.has_attitude = False
+    flight.run(5)
+    assert flight.gate.why_not == "no autopilot attitude"
+    flight.run(0.1, **doubt)
+    flight.has_attitude = True
+    assert not flight.run(proof_s - 0.05)
+    assert flight.run(0.2)
+    assert {pose.reset_counter for _, pose in flight.sent} == {0}
+
+
 def test_poses_stop_without_attitude() -> None:
     """And none is predicted unchecked: attitude is extrapolated by at most 120 ms."""
     flight = Flight()
@@ -302,8 +317,8 @@ def test_poses_stop_without_attitude() -> None:
     assert not [at for at, _ in flight.sent if at > silent_ns + 300 * MS]
     assert not flight.gate.sending and flight.gate.why_not == "no autopilot attitude"
     flight.has_attitude = True
-    assert not flight.run(0.9)
-    assert flight.run(0.4)
+    assert not flight.run(0.3)
+    assert flight.run(0.2)
 
 
 def test_attitudes_are_not_interpolated_over_gaps() -> None:
@@ -484,9 +499,9 @@ def test_a_bridge_ends_where_its_uncertainty_does() -> None:
     assert len(flight.run(1, **BLIND, sigma_position_m=1.01)) <= 8  # max_gap_ms predicted
     assert (flight.gate.state, flight.gate.why_not) == (Sending.OFF, "lost")
     assert not flight.run(2, **BLIND)  # nothing begins on a bridge
-    assert not flight.run(0.9)
+    assert not flight.run(0.3)  # tracked where dead reckoning has foretold
     assert flight.state() is Sending.PROVING
-    assert flight.run(0.3)
+    assert flight.run(0.2)
 
 
 @pytest.mark.parametrize(("late_s", "resumes"), [(0.5, True), (3.5, False)])
@@ -555,12 +570,26 @@ def test_a_bridge_is_level_by_the_autopilot_too() -> None:
     assert flight.state() is Sending.OFF
 
 
-def test_a_reset_while_bridging_needs_proof() -> None:
+@pytest.mark.parametrize(("off_m", "proof_s", "down_m"), [(3.0, 0.3, -3.0), (5.0, 1.0, 40.0)])
+@pytest.mark.parametrize("uncertain_s", [0.0, 2.0])
+def test_a_reset_that_ends_dead_reckoning_is_proven_by_how_far_it_leads(
+    off_m: float, proof_s: float, down_m: float, uncertain_s: float
+) -> None:
+    """To where it may have been off by is briefly; then heights are those of before, too."""
+    start_down_m = -3.0
     flight = Flight()
+    flight.gate = PoseGate(FeedbackConfig(), start_down_m=lambda _t_ns: start_down_m)
     flight.run(2)
-    flight.run(1, **BLIND)
-    assert not [pose for pose in flight.run(0.9, reset_counter=1) if pose.reset_counter]
+    flight.run(1, **BLIND, sigma_position_m=0.9)
+    start_down_m = 40.0
+    flight.run(uncertain_s, **BLIND, sigma_position_m=1.1)
+    at = np.array([1.0 + flight.now_ns * 1e-9 * 2, 2.0 + off_m, -3.0])
+    there = Pose(rotation_from_quaternion(ATTITUDE), at)
+    seen: dict[str, Any] = {"reset_counter": 1, "world_from_body": there}
+    assert not [pose for pose in flight.run(proof_s, **seen) if pose.reset_counter]
     assert flight.state() is Sending.PROVING
+    first = flight.run(0.2, **seen)[0]
+    assert first.world_from_body.translation[2] == pytest.approx(down_m)
 
 
 def test_a_stand_is_sent_and_a_lift_off_bridged() -> None:

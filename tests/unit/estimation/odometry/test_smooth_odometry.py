@@ -218,6 +218,31 @@ def test_accelerometers_carry_the_pose_on(pictures: bool) -> None:
     assert {each.reset_counter for each in found} == {0}
 
 
+@pytest.mark.parametrize(("sigmas", "n_refused"), [(3.0, 0), (6.0, 5)])
+def test_a_map_seen_again_is_taken_at_once_where_dead_reckoning_may_have_been_so_far_off(
+    sigmas: float, n_refused: int
+) -> None:
+    """Beyond, as after any jump, once half a second of it agrees; both are resets."""
+    integral = AccelerationIntegral()
+    odometry = SmoothOdometry(CAMERA, 1.0, BodyFilter(integral))
+    found: list[Odometry] = []
+    for k in range(180):
+        for step in range(10):
+            t_ns = (k * 10 + step - 9) * 10_000_000
+            integral.take(ImuSample(t_ns, np.zeros(3), np.array([0.0, 0.0, -9.80665])))
+            integral.take(AttitudeSample(t_ns, np.array([1.0, 0.0, 0.0, 0.0])))
+        odometry.begin(k * 100_000_000, BodyAttitude(k * 100_000_000, np.eye(3)))
+        blind = 100 <= k < 160
+        off_m = 0.0 if k < 160 else sigmas * found[159].sigma_position_m
+        seen = Track(k, k * 100_000_000, TrackState.LOST) if blind else track(k, 0.5 * off_m)
+        found.append(give(odometry, seen))
+    assert sigmas * found[159].sigma_position_m > 1.0
+    again = [k for k, each in enumerate(found) if each.state is TrackState.TRACKING and k >= 160]
+    assert again[0] == 160 + n_refused
+    assert [found[159].reset_counter, found[again[0]].reset_counter] == [0, 1]
+    assert found[-1].reset_counter == 1
+
+
 @pytest.mark.parametrize(("scale", "is_taken"), [(1.0, True), (1.1, True), (2.0, False)])
 def test_another_map_goes_on_from_where_accelerometers_had_its_first_view(
     scale: float, is_taken: bool
