@@ -123,6 +123,24 @@ def nearest_rotation(matrix: Array) -> Array:
     return out
 
 
+def best_similarity(a: Array, b: Array, rotation: Array | None = None) -> Similarity:
+    """Similarity from points `a` (N, 3) to `b` with the least squared error (Umeyama 1991).
+
+    A rotation that is given is kept.
+    """
+    mean_a, mean_b = a.mean(0), b.mean(0)
+    a, b = a - mean_a, b - mean_b
+    if rotation is None:
+        u, d, vt = np.linalg.svd(b.T @ a)
+        sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+        rotation = u @ sign @ vt
+        scale = float((d * np.diag(sign)).sum() / max(float((a * a).sum()), 1e-18))
+    else:
+        a = a @ rotation.T
+        scale = float(np.sqrt((b * b).sum() / max(float((a * a).sum()), 1e-18)))
+    return Similarity(scale, rotation, mean_b - scale * rotation @ mean_a)
+
+
 def rotation_from_vector(rotvec: Array) -> Array:
     """Rotation (3, 3) of a rotation vector (3,) in radians (Rodrigues).
 

@@ -135,8 +135,3 @@ def wait_s(stop: threading.Event, seconds: float) -> None:
 def thread_s() -> float:
     """CPU seconds used by this thread."""
     return time.thread_time()
-
-
-def cpu_s() -> float:
-    """CPU seconds used by this process."""
-    return time.process_time()

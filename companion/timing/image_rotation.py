@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, rotation_from_vector, vector_from_rotation
+from companion.geometry.transforms import (
+    Array,
+    nearest_rotation,
+    rotation_from_vector,
+    vector_from_rotation,
+)
 from companion.messages import Bytes, Frame
 
 WIDTH = 320
@@ -70,7 +75,6 @@ class RotationMeter:
             residual = after - before @ rotation_from_vector(vector)
             scale_now = max(cauchy_scale, float(np.median(np.linalg.norm(residual, axis=1))))
             weight = 1 / (1 + (np.linalg.norm(residual, axis=1) / scale_now) ** 2)
-            u, _, vt = np.linalg.svd((before * weight[:, None]).T @ after)
-            rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-            vector = vector_from_rotation(rotation)
+            turn = nearest_rotation((before * weight[:, None]).T @ after)
+            vector = vector_from_rotation(turn)
         return vector if float(np.linalg.norm(vector)) < MAX_ROTATION_RAD else None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import uniform_filter1d
 
-from companion.geometry.transforms import Array
+from companion.geometry.transforms import Array, nearest_rotation
 
 SMOOTH_S = 4.0
 """Slower changes are filtered out: gyroscope drift, and translation seen as rotation."""
@@ -169,8 +169,7 @@ def _refine(
     rotation = log_from_camera
     if rotation is None:  # estimated over all blocks: a single one may not determine it
         at = int(np.abs(shifts - best).argmin())
-        u, _, vt = np.linalg.svd(shifted[at].T @ rates)
-        rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+        rotation = nearest_rotation(shifted[at].T @ rates)
     each = np.array([_peak(rates[p], [m[p] for m in shifted], shifts, rotation)[0] for p in parts])
     if len(each) < 3:
         return offset_s + best, step_s, score

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.app.bench.injected_faults import FAULTS, NO_FAULT, Span
 from companion.app.replay.poses_sent import PosesSent
 from companion.config import Config
 from companion.config_file import load_config
@@ -26,6 +25,7 @@ from companion.telemetry import PositionSample, Telemetry
 from companion.timing.clock import StageTimes
 from drivers.flight import Flight
 from drivers.open_flight import open_flight
+from tests.bench.accuracy.injected_faults import FAULTS, NO_FAULT, Span
 
 
 class _Believing(SatelliteWatch):

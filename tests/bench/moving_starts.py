@@ -15,7 +15,7 @@ import argparse
 import numpy as np
 
 from companion.geometry.transforms import Array
-from companion.products.trajectory_error import Path
+from tests.bench.accuracy.path_errors import Path
 from tests.bench.blind import heading
 from tests.support.flights.moving_start import CAMERA, EXPOSURE_S, RATE_HZ, moving_path
 from tests.support.flights.rendered_flight import Terrain, fly

@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.app.bench.bench_slam import bench_slam
 from companion.app.progress import Progress
 from companion.config import Config
 from companion.config_file import load_config
@@ -26,6 +25,7 @@ from companion.geometry.transforms import Array, vector_from_rotation
 from drivers.open_flight import open_flight
 from drivers.telemetry.gpmf_gyro import gyro_rotation
 from drivers.telemetry.gpmf_track import blocks_of
+from tests.bench.accuracy.bench_slam import bench_slam
 from tests.support.processes.program import replay_here
 from tests.support.reference.scoring import read_tum
 

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.app.bench.injected_faults import FAULTS, JUMP_M, Fault, Samples, Span
 from companion.config_file import load_config
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.satellites.satellite_watch import SIGMAS, SatelliteWatch
@@ -26,6 +25,7 @@ from companion.runtime.in_order import in_order_of_time
 from companion.telemetry import AttitudeSample, PositionSample, PositionSource, Telemetry
 from companion.timing.clock import StageTimes
 from drivers.open_flight import open_flight
+from tests.bench.accuracy.injected_faults import FAULTS, JUMP_M, Fault, Samples, Span
 
 BACK_S = 10.0
 

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from companion.app.bench.injected_faults import OFFSET_AXIS, OFFSET_RAD
 from companion.config import Config
 from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.geometry.camera import Camera
@@ -36,6 +35,7 @@ from companion.slam.features.orb_features import FeatureExtractor, Features
 from companion.slam.initialisation.bootstrap import Bootstrap
 from companion.telemetry import AttitudeSample
 from drivers.open_flight import open_flight
+from tests.bench.accuracy.injected_faults import OFFSET_AXIS, OFFSET_RAD
 
 MAX_FRAMES = 60
 WRONG_RAD = np.radians(10.0)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from companion.app.bench.bench_slam import bench_slam
 from companion.app.progress import Progress
 from companion.config import Config
+from tests.bench.accuracy.bench_slam import bench_slam
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.geometry.transforms import Array, Pose
+from companion.geometry.transforms import Array, Pose, nearest_rotation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,6 +33,4 @@ def mean_rotation(samples: Sequence[AlignmentSample]) -> Array | None:
     ]
     if not rotations:
         return None
-    u, _, vt = np.linalg.svd(np.sum(rotations, axis=0))
-    out: Array = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    return out
+    return nearest_rotation(np.sum(rotations, axis=0))

@@ -15,7 +15,7 @@ from companion.estimation.georeference.tracked_places import Places
 from companion.estimation.georeference.trajectory_alignment import Scale
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_motion import InertialStart
-from companion.geometry.transforms import Array
+from companion.geometry.transforms import Array, nearest_rotation
 
 NOISES = tuple(0.5e-4 * 2.0**n for n in range(6))
 """White noise of a frame's place, units: 0.025 to 0.8 pixels of 500 at the typical distance."""
@@ -129,9 +129,7 @@ class InertialScale:
 
 def level_of(places: Places) -> Array:
     """Chordal mean of the rotations from map to NED, by attitude."""
-    sums = (places.ned_from_camera @ places.rotations.transpose(0, 2, 1)).sum(0)
-    u, _, vt = np.linalg.svd(sums)
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, np.float64)
+    return nearest_rotation((places.ned_from_camera @ places.rotations.transpose(0, 2, 1)).sum(0))
 
 
 def settled(

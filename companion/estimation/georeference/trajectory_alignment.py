@@ -15,6 +15,7 @@ from scipy.linalg import solve_triangular
 from companion.geometry.transforms import (
     Array,
     Similarity,
+    best_similarity,
     rotation_from_vector,
     skew,
     vector_from_rotation,
@@ -120,7 +121,7 @@ def _fit(
     scale: Scale | None,
 ) -> tuple[Similarity, Array, float, tuple[float, float]] | None:  # fmt: skip
     """The same with the scale as certain as it says; last the scale without it, and its sigma."""
-    estimate = _initial_guess(mapped, target, None if level is None else level.world_from_map)
+    estimate = best_similarity(mapped, target, None if level is None else level.world_from_map)
     if not np.isfinite(estimate.scale) or estimate.scale <= 0:
         return None
     keep, cholesky, equations = np.ones(len(t_s), bool), np.eye(len(t_s)), _Equations()
@@ -206,22 +207,6 @@ def _add_level(equations: _Equations, estimate: Similarity, level: Level | None)
         error_rad = vector_from_rotation(estimate.rotation @ level.world_from_map.T)
         equations.gradient[1:4] -= weight * error_rad
     equations.information[1:4, 1:4] += np.diag(weight)
-
-
-def _initial_guess(mapped: Array, target: Array, level: Array | None) -> Similarity:
-    """Closed form (Umeyama 1991); rotation fixed where the level is known."""
-    ma, mb = mapped.mean(0), target.mean(0)
-    a, b = mapped - ma, target - mb
-    if level is None:
-        u, d, vt = np.linalg.svd(b.T @ a)
-        sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
-        rotation = u @ sign @ vt
-        scale = float((d * np.diag(sign)).sum() / (a * a).sum())
-    else:
-        rotation = level
-        a = a @ level.T
-        scale = float(np.sqrt((b * b).sum() / max(float((a * a).sum()), 1e-18)))
-    return Similarity(scale, rotation, mb - scale * rotation @ ma)
 
 
 def _drift_cholesky(t_s: Array) -> Array:

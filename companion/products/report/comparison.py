@@ -11,10 +11,9 @@ from scipy.spatial import cKDTree
 
 from companion.config_file import CONSTANTS, current_key
 from companion.errors import InputError
-from companion.geometry.transforms import Array
+from companion.geometry.transforms import Array, best_similarity
 from companion.products.cloud import Cloud
 from companion.products.run_folder import FinishedRun
-from companion.products.trajectory_error import align
 
 MOST_POINTS = 200_000
 """Most points of a cloud looked up in the other; evenly sampled beyond it."""
@@ -140,7 +139,7 @@ def _poses(a: FinishedRun, b: FinishedRun) -> PoseDifference:
     chords = np.array([np.linalg.norm(of_a[t].rotation - of_b[t].rotation) for t in common])
     rms, scale = 0.0, 1.0
     if len(common) >= 3 and not np.array_equal(centres_a, centres_b):
-        found = align(centres_b, centres_a, True)
+        found = best_similarity(centres_b, centres_a)
         rms = float(np.sqrt(((found.apply(centres_b) - centres_a) ** 2).sum(1).mean()))
         scale = found.scale
     return PoseDifference(

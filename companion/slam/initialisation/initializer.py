@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.geometry.transforms import Array, Pose, angle_between
+from companion.geometry.transforms import Array, Pose, angle_between, nearest_rotation
 from companion.slam.features.orb_features import Bools, Features, Ints
 from companion.slam.features.triangulation import consistent, triangulate
 from companion.slam.initialisation.direction_certainty import direction_sigma_rad
@@ -119,8 +119,7 @@ def _explained_by_rotation(matches: _Matches, focal_px: float) -> Bools:
     error_px = np.zeros(len(rays_a))
     rotation = np.eye(3)
     for _ in range(15):  # robust Kabsch
-        u, _, vt = np.linalg.svd((rays_b * weight[:, None]).T @ rays_a)
-        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        rotation = nearest_rotation((rays_b * weight[:, None]).T @ rays_a)
         error_px = np.linalg.norm(rays_b - rays_a @ rotation.T, axis=1) * focal_px
         weight = 1.0 / (1.0 + (error_px / PURE_ROTATION_PX) ** 2) ** 2
     rotation_prior = matches.rotation_prior

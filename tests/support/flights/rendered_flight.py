@@ -24,7 +24,6 @@ from companion.geometry.transforms import (
 )
 from companion.messages import Bytes, Frame, KeyframeAdded, Odometry, Track, Warned
 from companion.products.flight_result import FlightResult
-from companion.products.trajectory_error import Path, PathErrors, path_errors
 from companion.runtime.in_order import in_order_of_time
 from companion.slam.map.site_map import SiteMap
 from companion.telemetry import (
@@ -35,6 +34,7 @@ from companion.telemetry import (
     RangeSample,
     Telemetry,
 )
+from tests.bench.accuracy.path_errors import Path, PathErrors, path_errors
 from tests.support.flights.noisy_telemetry import with_noise
 from tests.support.flights.reach import Reach
 from tests.support.flights.scene import leaves, texture

@@ -101,7 +101,7 @@ def test_out_that_is_a_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "command",
-    [("replay", SAMPLE), ("depth", SAMPLE), ("compare", SAMPLE, SAMPLE), ("bench", "slam", SAMPLE)],
+    [("replay", SAMPLE), ("depth", SAMPLE), ("compare", SAMPLE, SAMPLE)],
 )
 def test_out_that_cannot_be_written(command: tuple[str | Path, ...]) -> None:
     line = refused(companion(*command, "--out", "/proc/nowhere"))

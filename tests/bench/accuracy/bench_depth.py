@@ -10,20 +10,10 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import process_time
 
 import numpy as np
 
-from companion.app.bench.depth_accuracy import Accuracy, accuracy
-from companion.app.bench.depth_results import (
-    AfterFrames,
-    AsUsed,
-    AtThreshold,
-    DepthBench,
-    ReferenceAsUsed,
-    Timed,
-)
-from companion.app.bench.depth_tables import write_bench
-from companion.app.bench.remode_serial import RemodeSerial
 from companion.app.depth_command import Wanted, reconstruct
 from companion.app.progress import Progress
 from companion.compute.compute_devices import choose_device
@@ -34,9 +24,20 @@ from companion.dense.view_selection import Intrinsics
 from companion.errors import FlightError
 from companion.geometry.transforms import Pose
 from companion.messages import Bytes, DepthMap, Floats, PixelState
-from companion.timing.clock import StageTimes, cpu_s
+from companion.timing.clock import StageTimes
 from drivers.datasets.posed_images import PosedImages
 from drivers.datasets.posed_layouts import open_posed_images
+from tests.bench.accuracy.depth_accuracy import Accuracy, accuracy
+from tests.bench.accuracy.depth_results import (
+    AfterFrames,
+    AsUsed,
+    AtThreshold,
+    DepthBench,
+    ReferenceAsUsed,
+    Timed,
+)
+from tests.bench.accuracy.depth_tables import write_bench
+from tests.bench.accuracy.remode_serial import RemodeSerial
 
 CHECKPOINTS = (1, 5, 10, 15, 20, 25, 30, 40, 50, 75, 100, 150, 200, 300, 400)
 THRESHOLDS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
@@ -129,13 +130,13 @@ def _as_used(
             before[depth_map.keyframe_id] = _judged(depth_map, truths[depth_map.keyframe_id])
 
     times = StageTimes()
-    cpu = cpu_s()
+    cpu = process_time()
     try:
         with times("all"):
             maps = reconstruct(images.path, None, full, Wanted(None, frames, None), progress, look)
     except FlightError as error:
         return AsUsed(0, 0.0, 0.0, (), str(error))
-    cpu = cpu_s() - cpu
+    cpu = process_time() - cpu
     rows = tuple(
         ReferenceAsUsed(m.keyframe_id, *before[m.keyframe_id], *_judged(m, truths[m.keyframe_id]))
         for m in maps
@@ -189,7 +190,7 @@ def _run(
     engine: DepthEngine, scene: _Scene, others: Sequence[tuple[Bytes, Pose]]
 ) -> tuple[Timed, DepthMap]:
     times = StageTimes()
-    cpu = cpu_s()
+    cpu = process_time()
     rgb = np.repeat(scene.grey[..., None], 3, 2)
     with times("update"):
         engine.begin(scene.grey, scene.near, scene.far)
@@ -197,7 +198,7 @@ def _run(
             engine.update(grey, pose)
     with times("finish"):
         out = engine.finish(0, 0, rgb)
-    cpu = cpu_s() - cpu
+    cpu = process_time() - cpu
     return Timed(
         "companion", times.total_ms("update") / 1e3, times.total_ms("finish") / 1e3, cpu,
         *_judged(out, scene.truth),
@@ -216,10 +217,10 @@ def _run_serial(
     filter_ = RemodeSerial(scene.grey, (k.fx, k.fy, k.cx, k.cy), near, far)
     try:
         for n, (grey, pose) in enumerate(scene.others, 1):
-            cpu = cpu_s()
+            cpu = process_time()
             with times("update"):
                 filter_.update(grey, pose)
-            used_s += cpu_s() - cpu
+            used_s += process_time() - cpu
             if n in stops:
                 depth, converged = filter_.state()
                 after.append(
@@ -231,10 +232,10 @@ def _run_serial(
                 )  # fmt: skip
             step()
         depth, converged = filter_.state()
-        cpu = cpu_s()
+        cpu = process_time()
         with times("finish"):
             smooth = filter_.denoised()
-        used_s += cpu_s() - cpu
+        used_s += process_time() - cpu
     finally:
         filter_.close()
     return Timed(

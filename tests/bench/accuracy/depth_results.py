@@ -1,10 +1,10 @@
-"""Measurements of `companion bench depth`."""
+"""Measurements of `depth`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from companion.app.bench.depth_accuracy import Accuracy
+from tests.bench.accuracy.depth_accuracy import Accuracy
 
 
 @dataclass(frozen=True, slots=True)

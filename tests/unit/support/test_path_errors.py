@@ -11,7 +11,7 @@ from companion.geometry.transforms import (
     rotation_from_vector,
     yaw_rotation,
 )
-from companion.products.trajectory_error import Path, path_errors
+from tests.bench.accuracy.path_errors import Path, path_errors
 
 
 def made_path(n: int = 200) -> Path:

@@ -1,4 +1,4 @@
-"""Results of `companion bench slam`: a table, JSON, and pictures of the paths."""
+"""Results of `slam`: a table, JSON, and pictures of the paths."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from companion.products.atomic_file import write_atomically
 from companion.products.report.comparison_page import shown
-from companion.products.trajectory_error import Path, PathErrors, align, paired
+from tests.bench.accuracy.path_errors import Path, PathErrors, align, paired
 
 COLUMNS = (
     ("flight", "flight"), ("fault", "fault"), ("tracked", "tracked_share"),

@@ -1,5 +1,5 @@
 /* REMODE's depth filter (Pizzoli, Forster, Scaramuzza, ICRA 2014) for one core: the serial reference
- * that `companion bench depth` times the engine against. Written from the algorithm's description.
+ * that `python -m tests.bench.accuracy depth` times the engine against. Written from the algorithm's description.
  *
  * Depth is euclidean, along a pixel's unit ray. Images are float, row-major, 0..1. Poses are 3x4,
  * row-major. States: 0 update, 1 converged, 2 border, 3 diverged, 4 no match, 5 not seen.

@@ -14,8 +14,6 @@ from pathlib import Path as FilePath
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.app.bench.injected_faults import FAULTS, NO_FAULT, Fault, Span
-from companion.app.bench.slam_tables import BenchRow, write_bench
 from companion.app.progress import Progress
 from companion.config import Config
 from companion.errors import FlightError
@@ -28,12 +26,14 @@ from companion.geometry.transforms import (
 )
 from companion.messages import Frame, Odometry, Track, TrackState
 from companion.products.flight_result import FlightResult
-from companion.products.trajectory_error import Path, path_errors
 from companion.runtime.in_order import in_order_of_time
 from companion.runtime.peak_memory import peak_memory_mb
 from companion.timing.clock import StageTimes
 from drivers.flight import Flight, TruePose
 from drivers.open_flight import open_flight
+from tests.bench.accuracy.injected_faults import FAULTS, NO_FAULT, Fault, Span
+from tests.bench.accuracy.path_errors import Path, path_errors
+from tests.bench.accuracy.slam_tables import BenchRow, write_bench
 
 LEAD_NS = 10_000_000_000
 FRAME_PARTS = ("features", "tracking", "initialising")

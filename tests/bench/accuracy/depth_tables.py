@@ -1,4 +1,4 @@
-"""Results of `companion bench depth`: tables, JSON, and a plot of the curves."""
+"""Results of `depth`: tables, JSON, and a plot of the curves."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from companion.app.bench.depth_accuracy import Accuracy
-from companion.app.bench.depth_results import AsUsed, DepthBench
 from companion.products.atomic_file import write_atomically
+from tests.bench.accuracy.depth_accuracy import Accuracy
+from tests.bench.accuracy.depth_results import AsUsed, DepthBench
 
 
 def tables(bench: DepthBench) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.app.bench.injected_faults import FAULTS, Fault, Span
 from companion.geometry.transforms import angle_between, rotation_from_quaternion
 from companion.messages import Frame, Warned
 from companion.telemetry import (
@@ -14,6 +13,7 @@ from companion.telemetry import (
     PositionSource,
     Telemetry,
 )
+from tests.bench.accuracy.injected_faults import FAULTS, Fault, Span
 
 SPAN = Span(1_000_000_000, 11_000_000_000)
 LEVEL = np.array([1.0, 0, 0, 0])
