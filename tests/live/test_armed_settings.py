@@ -71,7 +71,7 @@ def test_what_the_ground_has_switched_off_stays_off(tmp_path: Path) -> None:
 def test_limits_wait_for_disarming(tmp_path: Path) -> None:
     """Of a configuration that is read again, and of one that a killed daemon finds changed."""
     config = tmp_path / "my.toml"
-    config.write_text("[feedback]\nmin_quality = 30\nmax_sigma_m = 1.0\nmax_jump_m = 1.0\n")
+    config.write_text("[expert.feedback]\nmin_quality = 30\nmax_sigma_m = 1.0\nmax_jump_m = 1.0\n")
     port = free_port(socket.SOCK_STREAM)
     settings = (f'router.clients=["tcpin:127.0.0.1:{port}"]',)
     with Flying(tmp_path, *settings, start=False) as flying:
@@ -81,7 +81,9 @@ def test_limits_wait_for_disarming(tmp_path: Path) -> None:
         flying.until_source("autopilot", "running")
         flying.autopilot.arm()
         flying.daemon.until(lambda health: health["flight"], "armed")
-        config.write_text("[feedback]\nmin_quality = 5\nmax_sigma_m = 0.5\nmax_jump_m = 9.0\n")
+        config.write_text(
+            "[expert.feedback]\nmin_quality = 5\nmax_sigma_m = 0.5\nmax_jump_m = 9.0\n"
+        )
         flying.daemon.send(signal.SIGHUP)
         line = flying.daemon.line("looser and wait for disarming").text
         assert "expert.feedback.min_quality" in line and "expert.feedback.max_jump_m" in line

@@ -83,13 +83,13 @@ def test_before_there_is_anything(tmp_path: Path) -> None:
 def test_told_to_read_its_configuration_again(tmp_path: Path) -> None:
     """What can be taken over is, what cannot is named, and what is wrong changes nothing."""
     config = tmp_path / "companion.toml"
-    config.write_text("[feedback]\nmin_quality = 30\n")
+    config.write_text("[expert.feedback]\nmin_quality = 30\n")
     with Daemon(tmp_path, *PATTERN, NO_DEPTH, config=config) as daemon:
         daemon.until(lambda health: True, "it answers")
         for text, answer in (
-            ("[feedback]\nmin_quality = 40\n", "configuration read again"),
+            ("[expert.feedback]\nmin_quality = 40\n", "configuration read again"),
             ("[link]\nurl = 'udpin:127.0.0.1:9'\n", "these need a restart: link.url"),
-            ("[feedback]\nmin_quality = 4000\n", "configuration not taken over"),
+            ("[expert.feedback]\nmin_quality = 4000\n", "configuration not taken over"),
             ("no table", "configuration not taken over"),
         ):
             config.write_text(text)

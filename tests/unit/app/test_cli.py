@@ -42,7 +42,7 @@ def test_version() -> None:
 
 def test_check_config_prints_what_it_read(tmp_path: Path) -> None:
     given = tmp_path / "given.toml"
-    given.write_text("[depth]\nstride = 7\n")
+    given.write_text("[expert.depth]\nstride = 7\n")
     result = companion("check-config", "--config", given, "--set", "opencl.device=gpu")
     assert (result.returncode, result.stderr) == (0, "")
     printed = tmp_path / "printed.toml"
