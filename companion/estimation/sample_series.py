@@ -27,11 +27,14 @@ class SampleSeries:
         last = self._n - 1
         return (int(self._times[last]), self._values[last]) if self._n else None
 
+    def takes(self, t_ns: int) -> bool:
+        """True unless a sample at a time is too close to the last one."""
+        return self._n == 0 or int(self._times[self._n - 1]) + MIN_SPACING_NS <= t_ns
+
     def add(self, t_ns: int, value: Array, horizontal_only: bool = False) -> None:
         """Add a sample of any shape; invalid or too closely spaced ones are dropped."""
         known = value[..., :2] if horizontal_only else value
-        early = self._n > 0 and t_ns - self._times[self._n - 1] < MIN_SPACING_NS
-        if early or not np.isfinite(known).all():
+        if not self.takes(t_ns) or not np.isfinite(known).all():
             return
         if not self._n:
             self._values = np.zeros((len(self._times), *value.shape))

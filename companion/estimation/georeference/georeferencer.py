@@ -107,6 +107,8 @@ class Georeferencer:
 
     def _integrate(self, series: SampleSeries, t_ns: int, velocity: Array) -> None:
         # rows: velocity and its integral; a GPS may lack the vertical component
+        if not series.takes(t_ns):
+            return
         if series.newest is None:
             series.add(t_ns, np.stack([velocity, 0.0 * velocity]), horizontal_only=True)
             return

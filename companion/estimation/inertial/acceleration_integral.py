@@ -57,13 +57,13 @@ class AccelerationIntegral:
         self._waiting: deque[ImuSample] = deque(maxlen=1000)
         self._attitudes: tuple[AttitudeSample, ...] = ()
         self._series = SampleSeries()
-        self._last: tuple[int, Array, Array] | None = None
-        """Time, acceleration (3,) and rotation (3, 3) of the last sample."""
-        self._sums = np.zeros((9, 3))
-        """Of the IMU. Rows: velocity, displacement, their derivatives by bias, number of gaps."""
-        self._lever_sums = np.zeros((9, 3))
+        self._last: tuple[int, Array] | None = None
+        """Time of the last sample; acceleration and its derivative by the bias, rows (4, 3)."""
+        self._velocity, self._displacement, self._n_gaps = np.zeros((4, 3)), np.zeros((4, 3)), 0
+        """Integrals of such rows, of the IMU, and number of gaps."""
+        self._lever = np.zeros((2, 3))
         """Difference of the place to the IMU, by the last sample: it is not integrated."""
-        self._raw: deque[Array] = deque(maxlen=3)
+        self._raw: deque[list[float]] = deque(maxlen=3)
         self._noise_variance = self._newest_variance = 0.0
         self._n = 0
         self._interval_s = 0.01
@@ -126,12 +126,8 @@ class AccelerationIntegral:
     def beyond(self, dt_s: float) -> Change:
         """Integrals over a time from the newest sample on, were its acceleration to stay."""
         assert self._last is not None, "no sample yet"
-        _, acceleration_m_s2, rotation = self._last
-        half_s2 = 0.5 * dt_s * dt_s
-        return Change(
-            dt_s, dt_s * acceleration_m_s2, half_s2 * acceleration_m_s2,
-            -dt_s * rotation, -half_s2 * rotation,
-        )  # fmt: skip
+        gained, moved = dt_s * self._last[1], 0.5 * dt_s * dt_s * self._last[1]
+        return Change(dt_s, gained[0], moved[0], gained[1:], moved[1:])
 
     def at(self, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
         """Integrals (N, 9, 3) up to times (N,), and a mask of times where they are known.
@@ -150,11 +146,11 @@ class AccelerationIntegral:
 
     def _see_noise(self, sample: ImuSample) -> None:
         """White noise by second differences, in which motion hardly shows at 100 Hz."""
-        self._raw.append(sample.accel_m_s2)
+        self._raw.append(sample.accel_m_s2.tolist())
         if len(self._raw) < 3:
             return
-        first, middle, last = self._raw
-        variance = float(((first - 2.0 * middle + last) ** 2).mean()) / 6.0
+        x, y, z = (a - 2.0 * b + c for a, b, c in zip(*self._raw, strict=True))
+        variance = (x * x + y * y + z * z) / 3.0 / 6.0
         self._n = min(self._n + 1, NOISE_TAU)
         self._noise_variance += (variance - self._noise_variance) / self._n
         self._newest_variance += (variance - self._newest_variance) / min(self._n, ONSET_TAU)
@@ -177,26 +173,28 @@ class AccelerationIntegral:
             share = (sample.t_ns - before.t_ns) / span_ns
             rotation = rotation_from_quaternion(first + share * (second - first))
             if self._lever_body_m is not None:
-                self._lever_sums[0] = rotation @ np.cross(sample.gyro_rad_s, self._lever_body_m)
-                self._lever_sums[1] = rotation @ self._lever_body_m
+                self._lever[0] = rotation @ np.cross(sample.gyro_rad_s, self._lever_body_m)
+                self._lever[1] = rotation @ self._lever_body_m
             self._add(sample.t_ns, rotation @ sample.accel_m_s2 + GRAVITY_NED_M_S2, rotation)
 
     def _add(self, t_ns: int, acceleration_m_s2: Array, rotation: Array) -> None:
         """Trapezoidal rule; displacement with acceleration linear between samples."""
-        last, self._last = self._last, (t_ns, acceleration_m_s2, rotation)
+        now = np.empty((4, 3))
+        now[0], now[1:] = acceleration_m_s2, -rotation
+        last, self._last = self._last, (t_ns, now)
         if last is None or not 0 < t_ns - last[0] <= MAX_GAP_NS:
-            self._sums[8] += 1.0
+            self._n_gaps += 1
         else:
-            dt_s = (t_ns - last[0]) * 1e-9
+            dt_s, was = (t_ns - last[0]) * 1e-9, last[1]
             self._interval_s += (dt_s - self._interval_s) / NOISE_TAU
-            was = np.vstack([last[1], -last[2]])
-            now = np.vstack([acceleration_m_s2, -rotation])
-            rates = self._sums[[0, 2, 3, 4]]
-            moved = rates * dt_s + (2.0 * was + now) * (dt_s * dt_s / 6.0)
-            changed = (was + now) * (dt_s / 2.0)
-            self._sums[[0, 2, 3, 4]] += changed
-            self._sums[[1, 5, 6, 7]] += moved
-        self._series.add(t_ns, self._newest_sums())
+            self._displacement += self._velocity * dt_s + (2.0 * was + now) * (dt_s * dt_s / 6.0)
+            self._velocity += (was + now) * (dt_s / 2.0)
+        if self._series.takes(t_ns):
+            self._series.add(t_ns, self._newest_sums())
 
     def _newest_sums(self) -> Array:
-        return np.asarray(self._sums + self._lever_sums)
+        """Rows (9, 3) as of `at`."""
+        out = np.empty((9, 3))
+        out[0], out[1] = self._velocity[0] + self._lever[0], self._displacement[0] + self._lever[1]
+        out[2:5], out[5:8], out[8] = self._velocity[1:], self._displacement[1:], self._n_gaps
+        return out

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isfinite
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,7 @@ MAX_GAP_NS = 100_000_000
 """Longer without a sample, nothing is integrated across."""
 MAX_SAMPLES = 32768
 """Nearly three minutes at 200 a second, 3 MB; the older half goes when they are full."""
+_IDENTITY = np.eye(3)
 
 
 class TurnIntegral:
@@ -28,14 +31,14 @@ class TurnIntegral:
     def take(self, sample: ImuSample) -> None:
         """Add a sample, in order of time; others are left out."""
         rates, last = sample.gyro_rad_s, self._n - 1
-        if not np.isfinite(rates).all() or (self._n and sample.t_ns <= self._t_ns[last]):
+        if (self._n and sample.t_ns <= self._t_ns[last]) or not all(map(isfinite, rates.tolist())):
             return
         if self._n == MAX_SAMPLES:
             half = MAX_SAMPLES // 2
             for each in (self._t_ns, self._rotations, self._rates, self._gaps):
                 each[:half] = each[half:]
             self._n, last = half, half - 1
-        rotation, gaps = np.eye(3), 0
+        rotation, gaps = _IDENTITY, 0
         if self._n:
             step_ns, gaps = sample.t_ns - int(self._t_ns[last]), int(self._gaps[last])
             rotation = self._rotations[last]
