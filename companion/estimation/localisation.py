@@ -306,8 +306,6 @@ class LocalisationStage:
                     self._motion.correct(message.t_ns, message.map_from_camera, measured)
                 corrected_rad = 0.0 if self._gimbal is None else self._gimbal.corrected_rad
                 self._attitude.compare(message, message.map_from_camera.rotation, corrected_rad)
-                mount = self._attitude.correction[0]
-                self._georeferences.take(message, None if measured is None else measured @ mount.T)
                 view = self._tracker.view_of(message.seq)
                 if view is not None and message.keyframe_id is not None:
                     self._georeferences.depths.compare(view, self._tracker.map, message.keyframe_id)
@@ -319,6 +317,10 @@ class LocalisationStage:
                         self._georeferences.of(self._tracker.map),
                     )  # fmt: skip
                     yield self._odometry.of_track(message)
+                if message.seq != frame.seq or self._smooth.found_again.certain:
+                    mount = self._attitude.correction[0]
+                    ned_from_body = None if measured is None else measured @ mount.T
+                    self._georeferences.take(message, ned_from_body)
                 placed = self._georeferences.main_from_newest.apply_to_pose(message.map_from_camera)
                 yield replace(message, map_from_camera=placed)
             elif isinstance(message, Track):

@@ -35,12 +35,17 @@ class Aid(Enum):
 
 
 class AidedPlace(NamedTuple):
-    """A tracked place (3,) of the body, local NED, metres, and `world_from_attitude` (3, 3)."""
+    """A tracked place (3,) of the body, local NED, metres, and `world_from_attitude` (3, 3).
+
+    The first in a map has the standard deviation of the map's scale: it says where that lies, and
+    nothing of where the body has gone.
+    """
 
     t_ns: int
     place_m: Array
     world_from_attitude: Array
     sigma_m: float
+    sigma_scale: float | None = None
 
     def moved(self, rotation: Array, about_m: Array, to_m: Array, scale: float) -> AidedPlace:
         """The same in another frame; see `BodyState.moved`."""

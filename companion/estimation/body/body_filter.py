@@ -9,6 +9,7 @@ Where no accelerations are to be had, or to be believed, the velocity is held.
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,7 @@ from companion.estimation.body.body_state import (
     DOWN,
     GROUND,
     N_STATE,
+    SCALE,
     BodyState,
     carried_on,
     held,
@@ -158,19 +160,33 @@ class BodyFilter:
         self.reset()
         self._state = _unknown()._replace(world_from_attitude=self.world_from_attitude)
 
-    def move(self, rotation: Array, about_m: Array, to_m: Array, scale: float) -> None:
-        """Change of the frame: what was at `about_m` is at `to_m`, turned and scaled about it."""
-        change = rotation, about_m, to_m, scale
-        still = scale == 1.0 and np.abs(to_m - about_m).max() < LEAST_MOVE
-        if still and np.abs(rotation - np.eye(3)).max() < LEAST_MOVE:
+    def move(self, rotation: Array, about_m: Array, to_m: Array) -> None:
+        """Change of the frame: what was at `about_m` is at `to_m`, turned about it."""
+        if np.abs(np.r_[to_m - about_m, (rotation - np.eye(3)).ravel()]).max() < LEAST_MOVE:
             return
+        self._change(
+            lambda state: state.moved(rotation, about_m, to_m, 1.0),
+            lambda place: place.moved(rotation, about_m, to_m, 1.0),
+        )
 
-        def moved(each: Aiding) -> Aiding:
-            return each.moved(*change) if isinstance(each, AidedPlace) else each
+    def rescale(self, about_m: Array, ratio: float, sigma: float) -> None:
+        """Change of the map's scale, known to `sigma` now: it has grown about a place (3,)."""
+        self._change(
+            lambda state: state.rescaled(about_m, ratio, sigma),
+            lambda place: place.moved(np.eye(3), about_m, about_m, ratio),
+        )
 
-        self._state = self._state.moved(*change)
-        self._waiting = deque(map(moved, self._waiting))
-        self._taken = deque((s.moved(*change), moved(each)) for s, each in self._taken)
+    def _change(
+        self, state: Callable[[BodyState], BodyState], place: Callable[[AidedPlace], AidedPlace]
+    ) -> None:
+        """Change all that is in the frame of the places."""
+
+        def changed(each: Aiding) -> Aiding:
+            return place(each) if isinstance(each, AidedPlace) else each
+
+        self._state = state(self._state)
+        self._waiting = deque(map(changed, self._waiting))
+        self._taken = deque((state(before), changed(each)) for before, each in self._taken)
 
     def at(self, t_ns: int) -> Reckoned | None:
         """Place and velocity at a time by autopilot stamps; None where not known.
@@ -207,7 +223,7 @@ class BodyFilter:
         # accelerations that do not fit what is seen are stated as less certain
         unlikely = max(1.0, float(np.sqrt(self._normalised)))
         velocity_ned_m_s = state.world_from_attitude.T @ mean[VELOCITY]
-        covariance = unlikely**2 * state.covariance[START, START]
+        covariance = unlikely**2 * state.in_true_metres().covariance[START, START]
         start = InertialStart(state.t_ns, velocity_ned_m_s, mean[BIAS].copy(), covariance)
         return Reckoned(
             mean[PLACE].copy(), mean[VELOCITY].copy(), unlikely * state.sigma(PLACE),
@@ -250,6 +266,10 @@ class BodyFilter:
             zero_m = float(before.mean[DOWN]) + measured.height_m
             self._state = before.with_part(BAROMETER, zero_m, SIGMA_BAROMETER_M)
             return
+        if isinstance(measured, AidedPlace) and measured.sigma_scale is not None:
+            self._taken.append((before, measured))
+            self._state, self._refused_since_ns = _placed(state, measured), None
+            return
         model = model_of(measured, state)
         if model is None:
             return
@@ -277,7 +297,7 @@ class BodyFilter:
         if squared > REFUSED[len(seen)]:
             return None, squared
         gain = np.linalg.solve(expected, gained).T
-        gain[list(model.considered)] = 0.0
+        gain[[*model.considered, SCALE]] = 0.0
         part = gain @ gained
         spread = spread - part - part.T + gain @ expected @ gain.T
         covariance = 0.5 * (spread + spread.T)
@@ -306,12 +326,18 @@ class BodyFilter:
         if not state.covariance[BIAS, BIAS].any():
             state = state.with_part(BIAS, state.mean[BIAS], SIGMA_BIAS_M_S2)
             state = state.with_part(TILT, state.mean[TILT], SIGMA_TILT_M_S2)
-        sigma_m = max(place.sigma_m, LEAST_SIGMA_PLACE_M)
-        state = state.with_part(PLACE, place.place_m, sigma_m)
-        state = state.with_part(VELOCITY, np.zeros(3), SIGMA_SPEED_M_S)
+        state = _placed(state, place).with_part(VELOCITY, np.zeros(3), SIGMA_SPEED_M_S)
         self._state = state._replace(t_ns=place.t_ns, world_from_attitude=place.world_from_attitude)
         self._begun, self._refused_since_ns = True, None
         self._taken.clear()
+
+
+def _placed(state: BodyState, place: AidedPlace) -> BodyState:
+    """The state with a place that is taken as it is."""
+    sigma_m = max(place.sigma_m, LEAST_SIGMA_PLACE_M)
+    if place.sigma_scale is None:
+        return state.with_part(PLACE, place.place_m, sigma_m)
+    return state.in_map(place.place_m, sigma_m, place.sigma_scale)
 
 
 def _unknown() -> BodyState:

@@ -12,7 +12,10 @@ from companion.geometry.transforms import Array
 
 DOWN, GROUND, BAROMETER = PLACE.stop - 1, TILT.stop, TILT.stop + 1
 """Down coordinates, after the state of `motion`: of the ground below, of the barometer's zero."""
-N_STATE = BAROMETER + 1
+SCALE = BAROMETER + 1
+"""Logarithm of the map's metre over the true one. Its mean is 0: it is not corrected, but what it
+has made of the rest of the state is known, so that it is put right when a better scale comes."""
+N_STATE = SCALE + 1
 TILT_TAU_S = 20.0
 """An autopilot's attitude is wrong otherwise after each manoeuvre."""
 BIAS_WALK_M_S2 = 1e-3
@@ -32,9 +35,9 @@ SIGMA_JERK_M_S3 = 10.0
 class BodyState(NamedTuple):
     """Mean (N,) and covariance (N, N) at a time, in the frame of the places that aid it.
 
-    The mean begins as that of `motion` does; then the heights of ground and barometer. Those
-    without a variance are not known. `world_from_attitude` (3, 3) goes from the autopilot's NED
-    axes to those of the places.
+    The mean begins as that of `motion` does, place and velocity in metres of the map; then the
+    heights of ground and barometer, and the map's scale. Those without a variance are not known.
+    `world_from_attitude` (3, 3) goes from the autopilot's NED axes to those of the places.
     """
 
     t_ns: int
@@ -57,6 +60,41 @@ class BodyState(NamedTuple):
             self.t_ns, mean, change @ self.covariance @ change.T,
             rotation @ self.world_from_attitude,
         )  # fmt: skip
+
+    def rescaled(self, about_m: Array, ratio: float, sigma: float) -> BodyState:
+        """The same in a map whose scale, known to `sigma` now, has grown by a ratio.
+
+        What the scale before was off by is known better, and what followed from it: the new scale
+        takes the place of the one before as if this had been known from the beginning.
+        """
+        variance = self.covariance[SCALE, SCALE]
+        if not variance > 0.0:
+            return self.without(SCALE)._with_scale(sigma).moved(np.eye(3), about_m, about_m, ratio)
+        by_scale = self.covariance[:, SCALE] / variance
+        mean = self.mean - by_scale * np.log(ratio)
+        mean[SCALE] = 0.0
+        change = (sigma**2 - variance) * np.outer(by_scale, by_scale)
+        state = self._replace(mean=mean, covariance=self.covariance + change)
+        return state.moved(np.eye(3), about_m, about_m, ratio)
+
+    def in_true_metres(self) -> BodyState:
+        """The same with a velocity in true metres."""
+        change = np.eye(N_STATE)
+        change[VELOCITY, SCALE] = -self.mean[VELOCITY]
+        return self._replace(covariance=change @ self.covariance @ change.T)
+
+    def in_map(self, place_m: Array, sigma_m: float, sigma_scale: float) -> BodyState:
+        """The same in another map, in which a place (3,) is where the body is by definition."""
+        state = self.in_true_metres().with_part(PLACE, place_m, sigma_m)
+        state = state.without(SCALE)._with_scale(sigma_scale)
+        change = np.eye(N_STATE)
+        change[VELOCITY, SCALE] = state.mean[VELOCITY]
+        return state._replace(covariance=change @ state.covariance @ change.T)
+
+    def _with_scale(self, sigma: float) -> BodyState:
+        covariance = self.covariance.copy()
+        covariance[SCALE, SCALE] = sigma**2
+        return self._replace(covariance=covariance)
 
     def without(self, *parts: slice | int) -> BodyState:
         """The same with parts that are not known."""
@@ -101,7 +139,11 @@ def _changed(state: BodyState, t_ns: int, change: Change, density_m_s2: float) -
     mean = found.step @ state.mean
     mean[PLACE] += found.moved_m
     mean[VELOCITY] += found.gained_m_s
-    covariance = found.step @ state.covariance @ found.step.T + found.noise
+    step = found.step
+    gained_m_s = mean[VELOCITY] - state.mean[VELOCITY]
+    step[VELOCITY, SCALE] = gained_m_s
+    step[PLACE, SCALE] = mean[PLACE] - state.mean[PLACE] - change.dt_s * state.mean[VELOCITY]
+    covariance = step @ state.covariance @ step.T + found.noise
     return _walked(state, state._replace(t_ns=t_ns, mean=mean, covariance=covariance))
 
 

@@ -22,7 +22,7 @@ from companion.estimation.odometry.odometry_course import FLOOR_M, FLOOR_RAD, Od
 from companion.estimation.odometry.odometry_frame import MapView, OdometryState, drift_m
 from companion.estimation.odometry.stand import Stand
 from companion.estimation.odometry.tracked_velocity import tracked_velocity
-from companion.estimation.odometry.tracking_quality import quality_of
+from companion.estimation.odometry.tracking_quality import FoundAgain, quality_of
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Georeference, Odometry, Track, TrackState
@@ -30,6 +30,8 @@ from companion.messages import Georeference, Odometry, Track, TrackState
 QUALITY_MARGIN = 1.5
 """Below this, times the least quality that is sent, good inertial navigation counts for more: a
 vehicle that turns on the spot sees new ground without parallax."""
+FAIR_SIGMA_M = 1.0
+"""As long as it is this certain, it counts for more than a map that may not have been found."""
 SIGMA_DOUBTED_M, SIGMA_DOUBTED_M_S = 0.1, 0.1
 """At least, of inertial navigation that a wrong map has aided."""
 LEAST_GONE_M, STANDS_RATIO = 0.25, 0.3
@@ -62,6 +64,9 @@ class SmoothOdometry:
         self._stand = Stand(self._course, self.ground)
         self._starts = MapStarts(self._course, self._stand)
         self._heading = LiftOffHeading()
+        self.found_again = FoundAgain()
+        self._aided_by: int | None = None
+        """The map that aided inertial navigation last."""
         self._agreed_m: Array = np.zeros(3)
         """Place (3,) at which the map and inertial navigation agreed last."""
         self.stands_since_ns: int | None = None
@@ -107,10 +112,12 @@ class SmoothOdometry:
         keyframes at which the points in view were made.
         """
         self._course.drift.see(born)
+        quality = quality_of(track, self._size)
+        self.found_again.see(track, segment, quality)
         found = (
             self._stand.odometry(track)
             if self.ground.stood is not None
-            else self._of_map(track, segment, georeference, velocity_map, first)
+            else self._of_map(track, segment, georeference, velocity_map, first, quality)
         )
         self._course.given = self._course.given or found.world_from_body is not None
         return found
@@ -128,7 +135,7 @@ class SmoothOdometry:
 
     def _of_map(
         self, track: Track, segment: int, georeference: Georeference | None,
-        velocity_map: ImageVelocity | None, first: MapView | None,
+        velocity_map: ImageVelocity | None, first: MapView | None, quality: int,
     ) -> Odometry:  # fmt: skip
         course, flown = self._course, self._course.flown
         pose, reckoned = track.map_from_camera, self.reckoning.reckoned
@@ -144,16 +151,17 @@ class SmoothOdometry:
         elif georeference is not active.georeference:
             ratio = flown.georeferenced(georeference)
             if flown.last is not None:
-                place_m = flown.last.place_m
-                course.body.move(np.eye(3), place_m, place_m, ratio)
+                course.body.rescale(flown.last.place_m, ratio, georeference.sigma_scale)
         assert flown.placed is not None
         raw = flown.placed.world_from_body(pose)
         if track.state is TrackState.DEAD_RECKONING:
             if reckoned is not None:
                 return course.reckoned(track)
             return course.dead_reckoned(track, pose, raw, georeference)
-        quality = quality_of(track, self._size)
         if quality < self._least_quality and self.reckoning.is_good:
+            return course.reckoned(track)
+        fair = reckoned is not None and reckoned.sigma_place_m < FAIR_SIGMA_M
+        if not self.found_again.certain and fair:
             return course.reckoned(track)
         attitude = self.reckoning.attitude
         image_m = track.sigma_position * georeference.world_from_map.scale
@@ -161,11 +169,11 @@ class SmoothOdometry:
         if self._stands(track.t_ns, flown.frame.from_world @ raw):
             self._aid(track.t_ns, flown.frame.from_world @ raw, georeference, noise_m)
             return course.none(Track(track.seq, track.t_ns, TrackState.LOST))
+        here = flown.frame.from_world @ raw  # also where dead reckoning was off
         seen_again = course.dead_reckoning
         if seen_again:
             self._starts.reacquire(raw, track.t_ns)
         frame, last = flown.frame, flown.last
-        here = frame.from_world @ raw
         if last is not None:
             dt_s = min((track.t_ns - last.t_ns) * 1e-9, 1.0)
             span_s = 0.0 if first is None else (track.t_ns - first.t_ns) * 1e-9
@@ -188,9 +196,7 @@ class SmoothOdometry:
         if not within_gate or ceased:
             course.reset()
         course.gate.clear()
-        course.body.move(
-            placed.rotation @ here.rotation.T, here.translation, placed.translation, 1.0
-        )
+        course.body.move(placed.rotation @ here.rotation.T, here.translation, placed.translation)
         self._aid(track.t_ns, placed, georeference, noise_m)
         to_world = georeference.world_from_map
         found = tracked_velocity(
@@ -218,7 +224,13 @@ class SmoothOdometry:
         attitude = self.reckoning.attitude
         if attitude is not None and georeference.sigma_scale < MAX_SIGMA_SCALE_AIDING:
             turned = placed.rotation @ attitude.ned_from_body.T
-            self._course.body.aid(AidedPlace(attitude.t_ns, placed.translation, turned, noise_m))
+            active = self._course.flown.placed
+            segment = None if active is None else active.segment
+            self._course.body.aid(AidedPlace(
+                attitude.t_ns, placed.translation, turned, noise_m,
+                georeference.sigma_scale if segment != self._aided_by else None,
+            ))  # fmt: skip
+            self._aided_by = segment
             self.ground.map_aided(t_ns)
 
     def _stands(self, t_ns: int, placed: Pose) -> bool:

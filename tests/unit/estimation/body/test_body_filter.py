@@ -98,13 +98,63 @@ def test_a_frame_that_moves_takes_the_body_with_it() -> None:
     flown = Flown(weaving, 4, 1.0)
     before = flown.navigation.at(round((AIDED_S + 0.9) * 1e9))
     turn, about, to = yaw_rotation(-0.4), np.array([20.0, 5.0, -3.0]), np.array([1.0, 2.0, 3.0])
-    flown.navigation.move(turn, about, to, 1.02)
+    flown.navigation.move(turn, about, to)
+    flown.navigation.rescale(to, 1.02, 0.01)
     after = flown.navigation.at(round((AIDED_S + 0.9) * 1e9))
     assert before is not None and after is not None
     # but for what was measured since the last place, whose unit is the metre
     expected = to + 1.02 * turn @ (before.place_m - about)
     assert np.linalg.norm(after.place_m - expected) < 0.1
     assert np.linalg.norm(after.velocity_m_s - 1.02 * turn @ before.velocity_m_s) < 0.1
+
+
+@pytest.mark.parametrize("off", [-0.06, 0.04])
+def test_what_a_wrong_scale_has_taught_is_put_right_with_it(off: float) -> None:
+    """A map whose scale is off for its first five seconds, in which the body has accelerated.
+
+    What accelerometers seem to be off by then is of the map: believed, it would carry the body away
+    once nothing is seen.
+    """
+    found_s, blind_s = 5.0, 5.0
+    for seed in range(3):
+        rng, integral = np.random.default_rng(seed), AccelerationIntegral()
+        navigation, motion = BodyFilter(integral), MeasuredMotion(weaving, rng, AIDED_S + blind_s)
+        scale, start_m, next_s = 1.0 + off, weaving(0.0), 0.0
+        for sample in motion.samples():
+            integral.take(sample)
+            t_s = sample.t_ns * 1e-9
+            if not next_s <= t_s < AIDED_S:
+                continue
+            if scale != 1.0 and t_s >= found_s:  # from now on it goes on as large as it is
+                last_m = start_m + scale * (weaving(t_s) - start_m)
+                navigation.rescale(last_m, 1.0 / scale, 0.005)
+                start_m, scale = last_m + start_m - weaving(t_s), 1.0
+            at_m = start_m + scale * (weaving(t_s) - weaving(0.0))
+            at_m = at_m + rng.normal(scale=SIGMA_M, size=3)
+            sigma_scale = abs(off) if next_s == 0.0 else None
+            turn = turned(t_s) @ (motion.tilt @ turned(t_s)).T
+            navigation.aid(AidedPlace(sample.t_ns, at_m, turn, SIGMA_M, sigma_scale))
+            next_s += 1.0 / 15.0
+        t_s = AIDED_S + blind_s - 0.05
+        found = navigation.at(round(t_s * 1e9))
+        assert found is not None
+        error_m = found.place_m - start_m - weaving(t_s) + weaving(0.0)
+        print(f"{error_m.round(2)} m off, {found.sigma_place_m:.2f} m stated")
+        assert np.abs(error_m).max() < 3.0 * found.sigma_place_m and found.sigma_place_m < 1.0
+
+
+def test_where_another_map_lies_says_nothing_of_the_motion() -> None:
+    """It was placed where this navigation had the body."""
+    flown = Flown(weaving, 3, 5.0)
+    t_ns = round((AIDED_S + 4.5) * 1e9)
+    before, at_m = flown.navigation.at(t_ns), np.array([50.0, -7.0, 3.0])
+    flown.navigation.aid(AidedPlace(t_ns, at_m, WORLD_FROM_NED, SIGMA_M, 0.02))
+    after = flown.navigation.at(t_ns)
+    assert before is not None and after is not None
+    np.testing.assert_array_equal(after.place_m, at_m)
+    np.testing.assert_array_equal(after.velocity_m_s, before.velocity_m_s)
+    assert after.sigma_velocity_m_s >= before.sigma_velocity_m_s
+    assert flown.navigation.n_refused == {}
 
 
 def test_a_place_that_cannot_be_is_refused_and_counted() -> None:

@@ -24,6 +24,8 @@ from companion.telemetry import AttitudeSample, ImuSample
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, body_from_camera=Pose.identity())
 KNOWN = np.zeros(200, np.int64)
 """Keyframes at which the points of a frame were made: all of them before."""
+OVER_ALL = np.random.default_rng(0).uniform(0.0, 480.0, (200, 2)).astype(np.float32)
+"""Points (200, 2) all over the picture."""
 PLACED = Georeference(Similarity(2.0, np.eye(3), np.zeros(3)), 0.01, 0.01, "GPS", 50, 0.3)
 SPEED = 1.0
 VELOCITY = ImageVelocity(np.array([SPEED, 0.0, 0.0]), 0.2)
@@ -40,7 +42,7 @@ def track(k: int, off: float = 0.0, state: TrackState = TrackState.TRACKING) -> 
     found = state is TrackState.TRACKING
     return Track(
         k, k * 100_000_000, state, pose, 0, pose, 200 if found else 0, 220 if found else 0,
-        np.zeros((200, 2), np.float32) if found else None, sigma_position=0.01,
+        OVER_ALL if found else None, sigma_position=0.01,
         sigma_rotation_rad=0.001,
     )  # fmt: skip
 
@@ -241,6 +243,50 @@ def test_a_map_seen_again_is_taken_at_once_where_dead_reckoning_may_have_been_so
     assert again[0] == 160 + n_refused
     assert [found[159].reset_counter, found[again[0]].reset_counter] == [0, 1]
     assert found[-1].reset_counter == 1
+
+
+def test_a_map_that_may_not_have_been_found_ends_no_dead_reckoning() -> None:
+    """By a few points of one corner; where these hold for two seconds it was."""
+    integral = AccelerationIntegral()
+    odometry = SmoothOdometry(CAMERA, 1.0, BodyFilter(integral))
+    corner = np.full((70, 2), 30.0, np.float32)
+    found = []
+    for k in range(160):
+        for step in range(10):
+            t_ns = (k * 10 + step - 9) * 10_000_000
+            integral.take(ImuSample(t_ns, np.zeros(3), np.array([0.0, 0.0, -9.80665])))
+            integral.take(AttitudeSample(t_ns, np.array([1.0, 0.0, 0.0, 0.0])))
+        odometry.begin(k * 100_000_000, BodyAttitude(k * 100_000_000, np.eye(3)))
+        seen = track(k)
+        if 100 <= k < 120:
+            seen = Track(k, k * 100_000_000, TrackState.LOST)
+        elif k >= 120:
+            off = 0.2 if k < 130 else 0.0
+            seen = replace(track(k, off), n_inliers=70, n_matches=80, keypoints_px=corner)
+        found.append(give(odometry, seen))
+        assert odometry.found_again.certain is (k < 100 or k > 139)
+    assert all(each.inertial == (100 <= k < 140) for k, each in enumerate(found))
+    assert np.abs(np.diff([north(each) for each in found]) - 0.2).max() < 0.03
+
+
+def test_inertial_navigation_learns_by_how_much_it_was_off() -> None:
+    """Where the map is seen again; the pose goes on all the same."""
+    integral = AccelerationIntegral()
+    odometry = SmoothOdometry(CAMERA, 1.0, BodyFilter(integral))
+    found = []
+    for k in range(135):
+        for step in range(10):
+            t_ns = (k * 10 + step - 9) * 10_000_000
+            wrong_m_s2 = 0.03 if k > 100 else 0.0
+            integral.take(ImuSample(t_ns, np.zeros(3), np.array([wrong_m_s2, 0.0, -9.80665])))
+            integral.take(AttitudeSample(t_ns, np.array([1.0, 0.0, 0.0, 0.0])))
+        odometry.begin(k * 100_000_000, BodyAttitude(k * 100_000_000, np.eye(3)))
+        blind = Track(k, k * 100_000_000, TrackState.LOST)
+        found.append(give(odometry, blind if 100 <= k < 130 else track(k)))
+    assert np.abs(np.diff([north(each) for each in found]) - 0.2).max() < 0.03
+    velocities = np.array([each.velocity_world_m_s for each in found], np.float64)
+    off_m_s = np.abs(velocities[:, 0] - 2.0 * SPEED)
+    assert off_m_s[129] > 0.07 and off_m_s[131:].max() < 0.03
 
 
 @pytest.mark.parametrize(("scale", "is_taken"), [(1.0, True), (1.1, True), (2.0, False)])
