@@ -114,7 +114,20 @@ def _explained_by_rotation(matches: _Matches, focal_px: float) -> Bools:
     All False if that rotation contradicts `rotation_prior`: a short translation over a plane
     resembles a rotation.
     """
-    rays_a, rays_b = _unit_rays(matches.xa), _unit_rays(matches.xb)
+    rotation, error_px = robust_rotation(matches.xa, matches.xb, focal_px)
+    rotation_prior = matches.rotation_prior
+    if rotation_prior is not None:
+        off_rad = float(PRIOR_ROTATION_RAD) + PRIOR_ROTATION_RATIO * angle_between(
+            rotation_prior, np.eye(3)
+        )
+        if angle_between(rotation, rotation_prior) >= off_rad:
+            return np.zeros(len(matches.xa), bool)
+    return np.asarray(error_px < PURE_ROTATION_PX, bool)
+
+
+def robust_rotation(xa: Array, xb: Array, focal_px: float) -> tuple[Array, Array]:
+    """Rotation `b_from_a` that explains most matches, and the error (N,) of each in pixels."""
+    rays_a, rays_b = _unit_rays(xa), _unit_rays(xb)
     weight = np.ones(len(rays_a))
     error_px = np.zeros(len(rays_a))
     rotation = np.eye(3)
@@ -122,14 +135,7 @@ def _explained_by_rotation(matches: _Matches, focal_px: float) -> Bools:
         rotation = nearest_rotation((rays_b * weight[:, None]).T @ rays_a)
         error_px = np.linalg.norm(rays_b - rays_a @ rotation.T, axis=1) * focal_px
         weight = 1.0 / (1.0 + (error_px / PURE_ROTATION_PX) ** 2) ** 2
-    rotation_prior = matches.rotation_prior
-    if rotation_prior is not None:
-        off_rad = float(PRIOR_ROTATION_RAD) + PRIOR_ROTATION_RATIO * angle_between(
-            rotation_prior, np.eye(3)
-        )
-        if angle_between(rotation, rotation_prior) >= off_rad:
-            return np.zeros(len(rays_a), bool)
-    return np.asarray(error_px < PURE_ROTATION_PX, bool)
+    return rotation, error_px
 
 
 def _unit_rays(normalised: Array) -> Array:

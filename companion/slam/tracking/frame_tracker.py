@@ -8,9 +8,11 @@ from companion.config import TrackingConfig
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose
 from companion.slam.features.klt_tracking import track_points
+from companion.slam.features.matching import match_descriptors
 from companion.slam.features.orb_features import Ints
 from companion.slam.features.patches import image_levels
 from companion.slam.features.view import View
+from companion.slam.initialisation.initializer import robust_rotation
 from companion.slam.loop.relocalizer import Relocalised
 from companion.slam.map.local_map import Projector, local_points
 from companion.slam.map.patch_refinement import refine_features
@@ -85,6 +87,23 @@ class FrameTracker:
             self._map.n_visible[visible.ids] += 1
             self._map.n_found[points[inlier]] += 1
         return True
+
+    def match_turned(self, view: View, guess: Pose, last: View, min_inliers: int) -> bool:
+        """Match a view from `guess`, turned as the images show, with the local map; success.
+
+        Without attitude a prediction knows no turn that begins.
+        """
+        ia, ib = match_descriptors(last.features, view.features)
+        if len(ia) < self._config.min_inliers:
+            return False
+        turn, _ = robust_rotation(
+            last.features.normalised[ia], view.features.normalised[ib], self._camera.focal_px
+        )
+        rotation = turn @ last.camera_from_map.rotation
+        centre = guess.inverse().translation
+        return self.match(
+            view, Pose(rotation, -rotation @ centre), self.local, 25.0, min_inliers=min_inliers
+        )
 
     def match_around(self, view: View, guess: Pose, min_inliers: int) -> bool:
         """Match a view of a camera that was lost with the map about where it should be; success.

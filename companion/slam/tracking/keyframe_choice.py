@@ -14,6 +14,9 @@ MIN_SHARE, MAX_PARALLAX_DEG, MAX_S = 0.75, 3.0, 3.0
 """A keyframe is inserted below this ratio of the reference's points (ORB-SLAM2's with depth), above
 this parallax, or after this time with some. With 0.9 the sample flight has 141 keyframes instead of
 125 and 5 mm less error, with 2 degrees 173 and the same, with 5 degrees 83 and 4 mm more."""
+FEW_POINTS = 100
+"""Without attitude a turn is not predicted: with fewer points than this in view the map must grow
+before the reference has lost a quarter of its own, which may be few as well."""
 N_NEWEST_EXCLUDED = 8
 """The newest keyframes never replace a new one: slow flight needs more of them."""
 MIN_SHARED, MAX_PARALLAX_RATIO = 0.5, 0.75
@@ -26,7 +29,8 @@ def needs_keyframe(slam_map: SlamMap, reference: Keyframe, view: View, since_ns:
     parallax_deg = _parallax_deg(slam_map, reference, view)
     late = view.t_ns - since_ns > MAX_S * 1e9 and parallax_deg > 0.5
     weak = share < MIN_SHARE and (parallax_deg > 0.4 or share < 0.5)
-    return weak or parallax_deg > MAX_PARALLAX_DEG or late
+    unsure = view.ned_from_camera is None and view.n_inliers < FEW_POINTS and parallax_deg > 0.4
+    return weak or unsure or parallax_deg > MAX_PARALLAX_DEG or late
 
 
 def equivalent_keyframe(slam_map: SlamMap, view: View) -> Keyframe | None:

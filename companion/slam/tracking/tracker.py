@@ -290,7 +290,8 @@ class Tracker:
             found = frame_tracker.match(view, guess, recent, 15.0, min_inliers=min_inliers)
             if not found and not has_attitude:
                 # the rotation is unknown: match descriptors first
-                found = self._relocalise_by_reference(view)
+                found = frame_tracker.match_turned(view, guess, last, min_inliers)
+                found = found or self._relocalise_by_reference(view)
             found = found or frame_tracker.match(view, guess, recent, 40.0, min_inliers=min_inliers)
             found = found or frame_tracker.match(
                 view, guess, frame_tracker.local, 25.0, min_inliers=min_inliers

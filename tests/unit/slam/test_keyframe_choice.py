@@ -9,6 +9,7 @@ from companion.slam.features.orb_features import Ints
 from companion.slam.features.view import View
 from companion.slam.map.sparse_map import SlamMap
 from companion.slam.tracking.keyframe_choice import (
+    FEW_POINTS,
     N_NEWEST_EXCLUDED,
     equivalent_keyframe,
     needs_keyframe,
@@ -56,3 +57,15 @@ def test_newest_and_weakly_tracked_keyframes_are_not_reused() -> None:
     assert equivalent_keyframe(slam_map, weak) is None
     aside = view_from(ground, slam_map, flown(np.array([-5.1, 1.5])))
     assert equivalent_keyframe(slam_map, aside) is None
+
+
+def test_without_attitude_a_map_of_few_points_grows_sooner() -> None:
+    ground = Ground(np.random.default_rng(13), n=400)
+    slam_map = mapped(ground, THERE, Similarity.identity())
+    reference = slam_map.keyframes[24]
+    place = flown(np.array([0.15, 0.0]))
+    few = view_from(ground, slam_map, place)
+    assert len(few.features) * 0.75 < few.n_inliers < FEW_POINTS
+    assert needs_keyframe(slam_map, reference, few, few.t_ns)
+    few.ned_from_camera = np.eye(3)
+    assert not needs_keyframe(slam_map, reference, few, few.t_ns)
