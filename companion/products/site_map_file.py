@@ -28,6 +28,7 @@ from companion.geometry.transforms import Array, Pose
 from companion.products.atomic_file import sync
 from companion.slam.compiled.patch_alignment import STORED
 from companion.slam.features.orb_features import features_of
+from companion.slam.map.map_points import PointArrays
 from companion.slam.map.site_map import (
     BORN_EARLIER,
     SiteGeoreference,
@@ -35,7 +36,7 @@ from companion.slam.map.site_map import (
     SitePart,
     pixels_of,
 )
-from companion.slam.map.sparse_map import Keyframe, PointArrays
+from companion.slam.map.sparse_map import Keyframe
 
 SITE_MAP = "site.map"
 """Its name in the folder of a run."""

@@ -24,7 +24,8 @@ from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Georeference
 from companion.slam.features.orb_features import features_of
 from companion.slam.map.map_part import MapPart
-from companion.slam.map.sparse_map import Keyframe, PointArrays
+from companion.slam.map.map_points import PointArrays
+from companion.slam.map.sparse_map import Keyframe
 
 MAGIC = b"COMPMAP\x01"
 """The last byte is the format version."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from companion.slam.compiled.patch_alignment import STORED
 from companion.slam.features.orb_features import Ints
-from companion.slam.map.sparse_map import N_OBSERVERS_KEPT, Keyframe, PointArrays, SlamMap
+from companion.slam.map.map_points import N_OBSERVERS_KEPT, PointArrays
+from companion.slam.map.sparse_map import Keyframe, SlamMap
 
 FEATURE_BYTES = 8 + 1 + 4 + 32 + 4 + 4 + 8 + 16
 """Size of a keyframe feature in a file: pixels, octave, angle, descriptor, its point, the point
@@ -89,7 +90,9 @@ def _by_nearness(slam_map: SlamMap, keyframe: Keyframe) -> chain[int]:
 
 def map_of(part: MapPart, scale_factor: float, n_levels: int, shift_ns: int = 0) -> SlamMap:
     """A map of its own from a part, keyframe times shifted by `shift_ns`."""
-    slam_map = SlamMap(scale_factor, n_levels, part.first_keyframe_id, part.level)
+    slam_map = SlamMap(
+        scale_factor, n_levels, first_keyframe_id=part.first_keyframe_id, level=part.level
+    )
     slam_map.load_points(part.points)
     for kept in part.keyframes:
         keyframe = replace(kept, t_ns=kept.t_ns + shift_ns, point_ids=kept.point_ids.copy())

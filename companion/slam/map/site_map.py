@@ -17,7 +17,8 @@ from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Floats
 from companion.slam.features.orb_features import Ints
 from companion.slam.map.map_part import MapPart, map_of, part_of
-from companion.slam.map.sparse_map import Keyframe, PointArrays, SlamMap
+from companion.slam.map.map_points import PointArrays
+from companion.slam.map.sparse_map import Keyframe, SlamMap
 
 EARLIER_NS = 4_000_000_000_000_000_000
 """Subtracted from times of keyframes that are not of this flight: no telemetry of now is of them,

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from companion.slam.features.orb_features import Ints
-from companion.slam.map.sparse_map import N_OBSERVERS_KEPT, Keyframe, Retired, SlamMap
+from companion.slam.map.map_points import N_OBSERVERS_KEPT
+from companion.slam.map.sparse_map import Keyframe, Retired, SlamMap
 
 MIN_REDUNDANT_RATIO, MIN_OBSERVERS = 0.9, 3
 MAX_COARSER_LEVELS = 1

@@ -143,8 +143,9 @@ class Mapper:
             if len(ia) == 0:
                 continue
             ids = slam_map.add_points(
-                keyframe.camera_from_map.inverse().apply(points), keyframe, ia, levels
-            )
+                keyframe.camera_from_map.inverse().apply(points),
+                keyframe.keyframe_id, keyframe.features, ia, levels,
+            )  # fmt: skip
             slam_map.add_observations(keyframe, ia, ids)
             slam_map.add_observations(other, ib, ids)
             slam_map.update_geometry(ids, [other, keyframe])

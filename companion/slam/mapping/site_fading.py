@@ -8,9 +8,9 @@ import numpy as np
 
 from companion.slam.features.orb_features import Bools
 from companion.slam.map.free_space import Looked, looked_through
+from companion.slam.map.map_points import PointArrays
 from companion.slam.map.site_flights import SiteFlight, disagreement_m
 from companion.slam.map.site_map import SiteMap
-from companion.slam.map.sparse_map import PointArrays
 
 
 def faded(site: SiteMap) -> SiteMap:

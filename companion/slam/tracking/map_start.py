@@ -23,8 +23,9 @@ def initialise_map(
     slam_map = atlas.map
     assert second.grey is not None
     ids = slam_map.add_points(
-        start.points_map, second, start.features_second, image_levels(second.grey)
-    )
+        start.points_map, second.keyframe_id, second.features, start.features_second,
+        image_levels(second.grey),
+    )  # fmt: skip
     for keyframe in (first, second):
         keyframe.refined_for[:] = -1  # a view that was tracked in another map names points of that
     slam_map.first_keyframe_id = first.keyframe_id
@@ -61,8 +62,9 @@ def continue_map(
     slam_map.keyframes_moved()
     slam_map.add_observations(first, tracked, last_tracked.point_ids[tracked])
     ids = slam_map.add_points(
-        continuation.points_map, first, continuation.features_first, image_levels(last_tracked.grey)
-    )
+        continuation.points_map, first.keyframe_id, first.features, continuation.features_first,
+        image_levels(last_tracked.grey),
+    )  # fmt: skip
     slam_map.add_observations(first, continuation.features_first, ids)
     slam_map.update_geometry(ids, [first])
     atlas.index_keyframe(first)

@@ -89,8 +89,9 @@ def mapped(
         fresh = np.array([i not in known for i in index.tolist()])
         new = np.flatnonzero(fresh)
         ids = slam_map.add_points(
-            map_from_world.apply(ground.points[index[new]]), keyframe, new, levels
-        )
+            map_from_world.apply(ground.points[index[new]]),
+            keyframe.keyframe_id, keyframe.features, new, levels,
+        )  # fmt: skip
         known.update(zip(index[new].tolist(), ids.tolist(), strict=True))
         points = np.array([known[i] for i in index.tolist()])
         slam_map.add_observations(keyframe, np.arange(len(features)), points)

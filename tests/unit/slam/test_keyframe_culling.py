@@ -167,7 +167,9 @@ def test_ids_of_removed_points_are_recycled(monkeypatch: pytest.MonkeyPatch) -> 
     most = 0
     last = np.zeros(0, np.int64)
     for _ in range(100):
-        ids = slam_map.add_points(np.ones((len(features), 3)), keyframe, features, levels)
+        ids = slam_map.add_points(
+            np.ones((len(features), 3)), 0, keyframe.features, features, levels
+        )
         assert not np.intersect1d(ids, kept).size
         assert not np.intersect1d(ids, last).size
         assert slam_map.alive[ids].all()

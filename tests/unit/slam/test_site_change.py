@@ -14,8 +14,8 @@ from companion.app.cli import main
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.products.site_map_file import write_site_map
+from companion.slam.map.map_points import PointArrays
 from companion.slam.map.site_map import SiteGeoreference, SiteMap, SitePart, site_map_of
-from companion.slam.map.sparse_map import PointArrays
 from companion.slam.mapping.site_change import SiteComparison, compare_sites
 from companion.slam.mapping.site_fading import faded
 from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped

@@ -94,7 +94,9 @@ def test_patch_rows_of_removed_points_are_reused(slam_map: SlamMap) -> None:
     features = np.arange(len(keyframe.features))
     positions: Array = np.zeros((len(features), 3))
     for _ in range(60):
-        ids = slam_map.add_points(positions, keyframe, features, levels)
+        ids = slam_map.add_points(
+            positions, keyframe.keyframe_id, keyframe.features, features, levels
+        )
         assert (slam_map.patches_of(ids).grey == 128).all()
         slam_map.alive[ids] = False
         slam_map.free_patches()
