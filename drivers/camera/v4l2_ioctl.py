@@ -56,44 +56,35 @@ EXPOSURE_MANUAL = 1
 MAX_PLANES = 8
 
 
+def _words(names: str) -> tuple[tuple[str, Any], ...]:
+    """Fields of 32 bits without sign, one after the other."""
+    return tuple((name, c_uint32) for name in names.split())
+
+
 class Capability(ctypes.Structure):
     """struct v4l2_capability."""
 
     _fields_ = (
-        ("driver", c_char * 16),
-        ("card", c_char * 32),
-        ("bus_info", c_char * 32),
-        ("version", c_uint32),
-        ("capabilities", c_uint32),
-        ("device_caps", c_uint32),
-        ("reserved", c_uint32 * 3),
-    )
+        ("driver", c_char * 16), ("card", c_char * 32), ("bus_info", c_char * 32),
+        *_words("version capabilities device_caps"), ("reserved", c_uint32 * 3),
+    )  # fmt: skip
 
 
 class Fmtdesc(ctypes.Structure):
     """struct v4l2_fmtdesc."""
 
     _fields_ = (
-        ("index", c_uint32),
-        ("type", c_uint32),
-        ("flags", c_uint32),
-        ("description", c_char * 32),
-        ("pixelformat", c_uint32),
-        ("mbus_code", c_uint32),
-        ("reserved", c_uint32 * 3),
-    )
+        *_words("index type flags"), ("description", c_char * 32), ("pixelformat", c_uint32),
+        ("mbus_code", c_uint32), ("reserved", c_uint32 * 3),
+    )  # fmt: skip
 
 
 class Frmsizeenum(ctypes.Structure):
     """struct v4l2_frmsizeenum: `size` is width and height, or least, most and step of each."""
 
     _fields_ = (
-        ("index", c_uint32),
-        ("pixel_format", c_uint32),
-        ("type", c_uint32),
-        ("size", c_uint32 * 6),
-        ("reserved", c_uint32 * 2),
-    )
+        *_words("index pixel_format type"), ("size", c_uint32 * 6), ("reserved", c_uint32 * 2),
+    )  # fmt: skip
 
 
 class Fract(ctypes.Structure):
@@ -106,62 +97,35 @@ class Frmivalenum(ctypes.Structure):
     """struct v4l2_frmivalenum: `interval` is the only one, or the shortest, longest and step."""
 
     _fields_ = (
-        ("index", c_uint32),
-        ("pixel_format", c_uint32),
-        ("width", c_uint32),
-        ("height", c_uint32),
-        ("type", c_uint32),
-        ("interval", Fract * 3),
+        *_words("index pixel_format width height type"), ("interval", Fract * 3),
         ("reserved", c_uint32 * 2),
-    )
+    )  # fmt: skip
 
 
 class PixFormat(ctypes.Structure):
     """struct v4l2_pix_format."""
 
     _fields_ = (
-        ("width", c_uint32),
-        ("height", c_uint32),
-        ("pixelformat", c_uint32),
-        ("field", c_uint32),
-        ("bytesperline", c_uint32),
-        ("sizeimage", c_uint32),
-        ("colorspace", c_uint32),
-        ("priv", c_uint32),
-        ("flags", c_uint32),
-        ("ycbcr_enc", c_uint32),
-        ("quantization", c_uint32),
-        ("xfer_func", c_uint32),
-    )
+        *_words("width height pixelformat field bytesperline sizeimage colorspace priv"),
+        *_words("flags ycbcr_enc quantization xfer_func"),
+    )  # fmt: skip
 
 
 class PlanePixFormat(ctypes.Structure):
     """struct v4l2_plane_pix_format."""
 
-    _fields_ = (
-        ("sizeimage", c_uint32),
-        ("bytesperline", c_uint32),
-        ("reserved", c_uint16 * 6),
-    )
+    _fields_ = (("sizeimage", c_uint32), ("bytesperline", c_uint32), ("reserved", c_uint16 * 6))
 
 
 class PixFormatMplane(ctypes.Structure):
     """struct v4l2_pix_format_mplane."""
 
     _fields_ = (
-        ("width", c_uint32),
-        ("height", c_uint32),
-        ("pixelformat", c_uint32),
-        ("field", c_uint32),
-        ("colorspace", c_uint32),
-        ("plane_fmt", PlanePixFormat * MAX_PLANES),
-        ("num_planes", c_uint8),
-        ("flags", c_uint8),
-        ("ycbcr_enc", c_uint8),
-        ("quantization", c_uint8),
-        ("xfer_func", c_uint8),
+        *_words("width height pixelformat field colorspace"),
+        ("plane_fmt", PlanePixFormat * MAX_PLANES), ("num_planes", c_uint8), ("flags", c_uint8),
+        ("ycbcr_enc", c_uint8), ("quantization", c_uint8), ("xfer_func", c_uint8),
         ("reserved", c_uint8 * 7),
-    )
+    )  # fmt: skip
 
 
 class _FormatUnion(ctypes.Union):
@@ -179,13 +143,9 @@ class Captureparm(ctypes.Structure):
     """struct v4l2_captureparm."""
 
     _fields_ = (
-        ("capability", c_uint32),
-        ("capturemode", c_uint32),
-        ("timeperframe", Fract),
-        ("extendedmode", c_uint32),
-        ("readbuffers", c_uint32),
-        ("reserved", c_uint32 * 4),
-    )
+        ("capability", c_uint32), ("capturemode", c_uint32), ("timeperframe", Fract),
+        ("extendedmode", c_uint32), ("readbuffers", c_uint32), ("reserved", c_uint32 * 4),
+    )  # fmt: skip
 
 
 class _ParmUnion(ctypes.Union):
@@ -202,13 +162,8 @@ class Requestbuffers(ctypes.Structure):
     """struct v4l2_requestbuffers."""
 
     _fields_ = (
-        ("count", c_uint32),
-        ("type", c_uint32),
-        ("memory", c_uint32),
-        ("capabilities", c_uint32),
-        ("flags", c_uint8),
-        ("reserved", c_uint8 * 3),
-    )
+        *_words("count type memory capabilities"), ("flags", c_uint8), ("reserved", c_uint8 * 3),
+    )  # fmt: skip
 
 
 class Timeval(ctypes.Structure):
@@ -221,14 +176,9 @@ class Timecode(ctypes.Structure):
     """struct v4l2_timecode."""
 
     _fields_ = (
-        ("type", c_uint32),
-        ("flags", c_uint32),
-        ("frames", c_uint8),
-        ("seconds", c_uint8),
-        ("minutes", c_uint8),
-        ("hours", c_uint8),
-        ("userbits", c_uint8 * 4),
-    )
+        ("type", c_uint32), ("flags", c_uint32), ("frames", c_uint8), ("seconds", c_uint8),
+        ("minutes", c_uint8), ("hours", c_uint8), ("userbits", c_uint8 * 4),
+    )  # fmt: skip
 
 
 class _PlanePlace(ctypes.Union):
@@ -239,68 +189,44 @@ class Plane(ctypes.Structure):
     """struct v4l2_plane."""
 
     _fields_ = (
-        ("bytesused", c_uint32),
-        ("length", c_uint32),
-        ("m", _PlanePlace),
-        ("data_offset", c_uint32),
-        ("reserved", c_uint32 * 11),
-    )
+        ("bytesused", c_uint32), ("length", c_uint32), ("m", _PlanePlace),
+        ("data_offset", c_uint32), ("reserved", c_uint32 * 11),
+    )  # fmt: skip
 
 
 class _BufferPlace(ctypes.Union):
     _fields_ = (
-        ("offset", c_uint32),
-        ("userptr", c_uint64),
-        ("planes", ctypes.POINTER(Plane)),
+        ("offset", c_uint32), ("userptr", c_uint64), ("planes", ctypes.POINTER(Plane)),
         ("fd", c_int32),
-    )
+    )  # fmt: skip
 
 
 class Buffer(ctypes.Structure):
     """struct v4l2_buffer."""
 
     _fields_ = (
-        ("index", c_uint32),
-        ("type", c_uint32),
-        ("bytesused", c_uint32),
-        ("flags", c_uint32),
-        ("field", c_uint32),
-        ("timestamp", Timeval),
-        ("timecode", Timecode),
-        ("sequence", c_uint32),
-        ("memory", c_uint32),
-        ("m", _BufferPlace),
-        ("length", c_uint32),
-        ("reserved2", c_uint32),
-        ("request_fd", c_int32),
-    )
+        *_words("index type bytesused flags field"), ("timestamp", Timeval), ("timecode", Timecode),
+        ("sequence", c_uint32), ("memory", c_uint32), ("m", _BufferPlace), ("length", c_uint32),
+        ("reserved2", c_uint32), ("request_fd", c_int32),
+    )  # fmt: skip
 
 
 class Queryctrl(ctypes.Structure):
     """struct v4l2_queryctrl."""
 
     _fields_ = (
-        ("id", c_uint32),
-        ("type", c_uint32),
-        ("name", c_char * 32),
-        ("minimum", c_int32),
-        ("maximum", c_int32),
-        ("step", c_int32),
-        ("default_value", c_int32),
-        ("flags", c_uint32),
+        ("id", c_uint32), ("type", c_uint32), ("name", c_char * 32), ("minimum", c_int32),
+        ("maximum", c_int32), ("step", c_int32), ("default_value", c_int32), ("flags", c_uint32),
         ("reserved", c_uint32 * 2),
-    )
+    )  # fmt: skip
 
 
 class Querymenu(ctypes.Structure):
     """struct v4l2_querymenu, of a menu of names."""
 
     _fields_ = (
-        ("id", c_uint32),
-        ("index", c_uint32),
-        ("name", c_char * 32),
-        ("reserved", c_uint32),
-    )
+        ("id", c_uint32), ("index", c_uint32), ("name", c_char * 32), ("reserved", c_uint32),
+    )  # fmt: skip
 
 
 class Control(ctypes.Structure):

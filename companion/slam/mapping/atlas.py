@@ -221,7 +221,7 @@ class Atlas:
                 return None
             moved = close_loop(segment, graph, relaxed)
         self.n_loops += 1
-        mapper.fuse(keyframe, other, seen_there)
+        mapper.close_loop(keyframe, other, seen_there)
         if found.there is self.site:
             self._take_over_site(segment, mapper)
         if self._background:
@@ -246,7 +246,7 @@ class Atlas:
             if key in segment.held:
                 self.index_keyframe(keyframe)
             else:
-                mapper.fuse_held(keyframe)
+                mapper.fusion.fuse_held(keyframe)
 
     def adjust_pending(self, yield_point: Callable[[], None]) -> None:
         """Globally adjust maps with closed loops while they go on; an `IdleWork`."""

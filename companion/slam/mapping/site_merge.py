@@ -49,7 +49,7 @@ def merge_sites(first: SiteMap, other: SiteMap, other_in_first: Similarity) -> S
     for _ in range(BINDING_ROUNDS):
         for key, keyframe in here.keyframes.items():
             if key not in here.held:
-                mapper.fuse_held(keyframe)
+                mapper.fusion.fuse_held(keyframe)
         _loosen(here, _n_ids(first))
         mapper.adjust_all(ITERATIONS)
     here.held = frozenset()

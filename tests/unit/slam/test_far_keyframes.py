@@ -109,7 +109,7 @@ def test_a_loop_with_keyframes_in_the_file_closes_as_without(tmp_path: Path) -> 
         graph = loop_graph(slam_map, found)
         close_loop(slam_map, graph, graph.relaxed())
         mapper = Mapper(CAMERA, slam_map, MapLock())
-        mapper.fuse(newest, other, slam_map.observations_of(other)[1])
+        mapper.close_loop(newest, other, slam_map.observations_of(other)[1])
         mapper.adjust_all(3)
         assert np.linalg.norm(newest.centre - before) > 0.3
     assert_same(*maps)

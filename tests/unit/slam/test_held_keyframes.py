@@ -56,10 +56,10 @@ def flown_on(atlas: Atlas, ground: Ground, pose: Pose, here_from_world: Similari
         here_from_world.apply_to_pose(pose).inverse(), features, np.full(len(features), -1),
         features.normalised.copy(), features.whitening.copy(), np.full(len(features), -1), GREY,
     )  # fmt: skip
-    seen = atlas.mapper._projector.visible(
+    seen = atlas.mapper.fusion._projector.visible(
         here, keyframe.camera_from_map, np.flatnonzero(here.alive[: here.n_points])
     )
-    points, found = atlas.mapper._projector.search(here, seen, features, 5.0)
+    points, found = atlas.mapper.fusion._projector.search(here, seen, features, 5.0)
     here.add_observations(keyframe, found, points)
     closed = atlas.insert_keyframe(here, keyframe)
     assert closed is not None
