@@ -7,21 +7,29 @@ guessed and nothing unknown is passed over; a key of the version before is told 
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import json
 import re
-import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
 import msgspec
 
 from companion.config import ADDRESS, EXPERT, Config
 from companion.config.computer_settings import NO_PROFILE, profile_text
+from companion.config.keys import (
+    dump,
+    kind_of,
+    listed_words_of,
+    number_or_word,
+    types_of_keys,
+    with_values,
+    words_of,
+)
+from companion.config.passwords import with_passwords_hidden
 from companion.errors import ConfigError
 
 if sys.version_info >= (3, 11):
@@ -42,15 +50,6 @@ CONSTANTS: Mapping[str, Any] = {
 
 KINDS = {"float": "a number", "int": "a whole number", "bool": "true or false", "str": "text"}
 """Python's types, as whoever sets a key calls them."""
-HIDDEN = "***"
-"""Text in place of a password."""
-_PASSWORD = re.compile(r"(://[^:/@\s]*):[^/\s]+@")
-_PASSWORD_GIVEN = re.compile(
-    r"""\b(user-pw|proxy-pw|password|passwd|pwd|pass|passphrase|\w*token|\w*secret)="""
-    r"""("[^"]*"|'[^']*'|[^\s&"'!]+)""",
-    re.IGNORECASE,
-)
-"""In a pipeline of GStreamer, and in the query of a URL."""
 
 
 @cache
@@ -146,13 +145,13 @@ def current_key(name: str) -> str:
     """The key that a key of the version before is now; "" for a constant, any other as it is."""
     if name in CONSTANTS:
         return ""
-    return f"{EXPERT}.{name}" if f"{EXPERT}.{name}" in _types() else name
+    return f"{EXPERT}.{name}" if f"{EXPERT}.{name}" in types_of_keys() else name
 
 
 def with_value(config: Config, name: str, value: Any, where: str) -> Config:
     """A configuration with one value changed, checked as one of a file; `where` it comes from."""
     try:
-        checked = msgspec.convert(value, _types()[name])
+        checked = msgspec.convert(value, types_of_keys()[name])
     except msgspec.ValidationError as error:
         words = ", ".join(words_of(name))
         wanted = f"wanted one of {words}" if words else _wanted_list(name) or _in_words(error)
@@ -160,7 +159,7 @@ def with_value(config: Config, name: str, value: Any, where: str) -> Config:
             word, least, most = limits
             wanted = f"wanted {word} or a number from {least:.15g} to {most:.15g}"
         raise ConfigError(f"{where}: {name}: {wanted}, given is {value!r}") from error
-    if ADDRESS in getattr(_types()[name], "__metadata__", ()) and not _is_address(checked):
+    if ADDRESS in getattr(types_of_keys()[name], "__metadata__", ()) and not _is_address(checked):
         raise ConfigError(f'{where}: {name}: wanted HOST:PORT, or "", given is {value!r}')
     if listed_words_of(name) and len(set(checked)) < len(checked):
         raise ConfigError(f"{where}: {name}: {_wanted_list(name)}, given is {value!r}")
@@ -184,49 +183,6 @@ def _in_words(error: msgspec.ValidationError) -> str:
     return f"wanted {KINDS[found[1]]}{found[2] or ''}{where}"
 
 
-def with_values(config: Config, values: Mapping[str, Any]) -> Config:
-    """The configuration with other values for some keys, not validated."""
-    for name, value in values.items():
-        section, key = name.split(".")[-2:]
-        part = dataclasses.replace(getattr(config, section), **{key: value})
-        config = dataclasses.replace(config, **{section: part})
-    return config
-
-
-def value_of_key(config: Config, name: str) -> Any:
-    """Value of a key."""
-    section, key = name.split(".")[-2:]
-    return getattr(getattr(config, section), key)
-
-
-def words_of(name: str) -> tuple[str, ...]:
-    """The words that a key may be; none where it is not one of a few."""
-    kind = _kind(name)
-    return get_args(kind) if get_origin(kind) is Literal else ()
-
-
-def number_or_word(name: str) -> tuple[str, float, float] | None:
-    """The word and the bounds of a key that may be either; None of any other key."""
-    kind = _kind(name)
-    if get_origin(kind) is not Union:
-        return None
-    of_word, of_number = get_args(kind)
-    (limits,) = of_number.__metadata__
-    return get_args(of_word)[0], limits.ge, limits.le
-
-
-def listed_words_of(name: str) -> tuple[str, ...]:
-    """The words that the list of a key may hold, each once; none where it is no list of words."""
-    kind = _kind(name)
-    of_each = get_args(kind)[0] if get_origin(kind) is tuple else None
-    return get_args(of_each) if get_origin(of_each) is Literal else ()
-
-
-def dump(config: Config) -> dict[str, Any]:
-    """Every key with its value."""
-    return {name: value_of_key(config, name) for name in _types()}
-
-
 def shown(config: Config) -> dict[str, Any]:
     """The same as tables of tables, with passwords made unreadable."""
     out: dict[str, Any] = {}
@@ -237,30 +193,6 @@ def shown(config: Config) -> dict[str, Any]:
             table = table.setdefault(each, {})
         table[key] = value
     return out
-
-
-def with_passwords_hidden(config: Config) -> Config:
-    """The configuration with the passwords of URLs and pipelines made unreadable.
-
-    Before it is text: in TOML and JSON a quote within a value is another one.
-    """
-    return with_values(config, {name: _hidden(value) for name, value in dump(config).items()})
-
-
-def _hidden(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return tuple(map(_hidden, value))
-    return without_passwords(value) if isinstance(value, str) else value
-
-
-def without_passwords(text: str) -> str:
-    """A text, with the passwords of URLs and pipelines in it made unreadable."""
-    return _PASSWORD_GIVEN.sub(rf"\1={HIDDEN}", _PASSWORD.sub(rf"\1:{HIDDEN}@", text))
-
-
-def command_shown(argv: Sequence[str]) -> str:
-    """A command line as a report has it: without passwords, and without where the program lies."""
-    return without_passwords(shlex.join([Path(argv[0]).name, *argv[1:]]))
 
 
 def to_toml(config: Config) -> str:
@@ -280,29 +212,10 @@ def toml_value(value: Any) -> str:
 
 
 @cache
-def _types() -> Mapping[str, Any]:
-    """Type of each key, with its bounds; keys of experts come last."""
-    found: dict[str, Any] = {}
-    of_experts: dict[str, Any] = {}
-    for section, of_section in get_type_hints(Config).items():
-        for key, hint in get_type_hints(of_section, include_extras=True).items():
-            if EXPERT in getattr(hint, "__metadata__", ()):
-                of_experts[f"{EXPERT}.{section}.{key}"] = hint
-            else:
-                found[f"{section}.{key}"] = hint
-    return found | of_experts
-
-
-@cache
 def _sections() -> frozenset[str]:
     """Every section of this version and the one before."""
-    known = {name.rpartition(".")[0] for name in [*_types(), *CONSTANTS]}
+    known = {name.rpartition(".")[0] for name in [*types_of_keys(), *CONSTANTS]}
     return frozenset({EXPERT, *known, *(name.removeprefix(f"{EXPERT}.") for name in known)})
-
-
-def _kind(name: str) -> Any:
-    hint = _types()[name]
-    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
 
 
 def _flat(table: Mapping[str, Any], prefix: str, where: str) -> Iterator[tuple[str, Any]]:
@@ -327,7 +240,7 @@ def _current(values: Mapping[str, Any], where: str, warn: Warn) -> dict[str, Any
         if not current:
             warn(f"{where}: {name} has no effect any more, {CONSTANTS[name]} counts: take it out")
             continue
-        if current not in _types():
+        if current not in types_of_keys():
             raise _unknown(name, where)
         if current != name:
             if current in values:
@@ -359,21 +272,21 @@ def _parse(text: str, name: str) -> Any:
         return text
     value = table["value"]
     # A device may be called 3090: what is wanted as text and was not quoted is text.
-    is_text = _kind(name) is str or words_of(name)
+    is_text = kind_of(name) is str or words_of(name)
     return text if is_text and not isinstance(value, str) else value
 
 
 def _unknown(name: str, where: str) -> ConfigError:
     section, _, key = name.rpartition(".")
     if section and section not in _sections():
-        known = {each.rpartition(".")[0]: None for each in _types()}
+        known = {each.rpartition(".")[0]: None for each in types_of_keys()}
         near = _nearest(f"[{section}]", [f"[{each}]" for each in known])
         return ConfigError(f"{where}: unknown section [{section}]{near}")
     same = section.split(".")[-1]
-    here = {each.split(".")[-1]: each for each in _types() if each.split(".")[-2] == same}
-    elsewhere = [each for each in _types() if each.endswith(f".{key}")]
+    here = {each.split(".")[-1]: each for each in types_of_keys() if each.split(".")[-2] == same}
+    elsewhere = [each for each in types_of_keys() if each.endswith(f".{key}")]
     close = difflib.get_close_matches(key, here, n=1)
-    others = elsewhere or list(_types())
+    others = elsewhere or list(types_of_keys())
     near = f"; did you mean {here[close[0]]}?" if close else _nearest(name, others)
     return ConfigError(f"{where}: unknown key {name}{near}")
 

@@ -18,7 +18,8 @@ from companion.app.doctor_command import doctor
 from companion.app.flights_command import list_flights, show_flight, trim_flight
 from companion.app.progress import Progress
 from companion.config import Config
-from companion.config_file import shown, without_passwords
+from companion.config.passwords import without_passwords
+from companion.config_file import shown
 from companion.errors import CompanionError, InputError
 from companion.products.atomic_file import write_atomically
 from drivers.recording.flights_folder import flown_in, recordings_in

@@ -10,16 +10,9 @@ from typing import Any
 
 import tomlkit
 
-from companion.config_file import (
-    config_of_text,
-    dump,
-    load_config,
-    toml_value,
-    value_of_key,
-    values_in,
-    values_of,
-    without_passwords,
-)
+from companion.config.keys import dump, value_of_key
+from companion.config.passwords import without_passwords
+from companion.config_file import config_of_text, load_config, toml_value, values_in, values_of
 from companion.errors import ConfigError
 from companion.products.atomic_file import write_atomically
 from drivers.images.calibration_file import own_calibration

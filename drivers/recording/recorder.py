@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from companion.config import Config
-from companion.config_file import to_toml, with_passwords_hidden
+from companion.config.passwords import with_passwords_hidden
+from companion.config_file import to_toml
 from companion.errors import StageError
 from companion.flight_notes import FlightNote, GateStep, HealthNote, LinkBytes
 from companion.geometry.camera import Camera

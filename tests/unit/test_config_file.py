@@ -7,18 +7,9 @@ from pathlib import Path
 import pytest
 
 from companion.config import MEASUREMENTS, Config
-from companion.config_file import (
-    command_shown,
-    current_key,
-    dump,
-    load_config,
-    shown,
-    to_toml,
-    value_of_key,
-    values_in,
-    with_passwords_hidden,
-    without_passwords,
-)
+from companion.config.keys import dump, value_of_key
+from companion.config.passwords import command_shown, with_passwords_hidden, without_passwords
+from companion.config_file import current_key, load_config, shown, to_toml, values_in
 from companion.errors import ConfigError
 from companion.page.setting_texts import settings
 from tests.support.settings_text import described_toml, settings_page

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from companion.app.stopping import StopSignals
-from companion.config_file import words_of
+from companion.config.keys import words_of
 from companion.errors import InputError
 
 PROFILE = "computer.profile"

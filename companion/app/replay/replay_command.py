@@ -11,7 +11,8 @@ from companion.app.progress import Progress
 from companion.app.replay.landing_sent import LandingSent
 from companion.app.replay.poses_sent import PosesSent
 from companion.config import Config
-from companion.config_file import command_shown, shown
+from companion.config.passwords import command_shown
+from companion.config_file import shown
 from companion.errors import FlightError, StageError
 from companion.estimation.site.site_use import LOCATED
 from companion.geometry.geodesy import GeoOrigin

@@ -6,7 +6,8 @@ import sys
 from collections.abc import Mapping
 
 from companion.config import Config
-from companion.config_file import command_shown, shown
+from companion.config.passwords import command_shown
+from companion.config_file import shown
 from companion.daemon.flights.live_flight import LiveFlight
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import ClockReport

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from companion.config import Config
-from companion.config_file import command_shown, shown
+from companion.config.passwords import command_shown
+from companion.config_file import shown
 from companion.daemon.nodes.kept_chunks import KeptChunks
 from companion.daemon.nodes.remote_viewing import RemoteViewing
 from companion.geometry.camera import Camera

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from companion.config import Config, ControlConfig, DistributedConfig, FeedbackConfig, LinkConfig
-from companion.config_file import to_toml, value_of_key
+from companion.config.keys import value_of_key
+from companion.config_file import to_toml
 from companion.daemon.component_state import (
     ACTIVE,
     BOOT,

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from companion.config import Config
-from companion.config_file import dump, load_config
+from companion.config.keys import dump
+from companion.config_file import load_config
 from companion.errors import ConfigError
 from companion.page.setting_texts import settings
 from companion.page.settings_file import SettingsFile, shown_value, value_of_text
