@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import sqlite3
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,20 +21,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import InputError
-from companion.geometry.camera import Camera, Distortion
-from companion.geometry.geodesy import GeoOrigin
-from companion.geometry.transforms import Array, Pose
 from companion.products.atomic_file import sync
-from companion.slam.compiled.patch_alignment import STORED
-from companion.slam.features.orb_features import features_of
-from companion.slam.map.map_points import PointArrays
-from companion.slam.map.site_map import (
-    BORN_EARLIER,
-    SiteGeoreference,
-    SiteMap,
-    SitePart,
-    pixels_of,
+from companion.products.site_map_rows import (
+    FEATURE,
+    POINT,
+    SiteHead,
+    covariances_of,
+    feature_rows,
+    head_json,
+    head_of,
+    keyframe_json,
+    keyframe_of,
+    part_json,
+    point_arrays,
+    point_rows,
+    site_part_of,
 )
+from companion.slam.map.site_map import SiteMap
 from companion.slam.map.sparse_map import Keyframe
 
 SITE_MAP = "site.map"
@@ -49,20 +51,6 @@ BLOCK = 1024
 DIGEST_BYTES = 16
 MAX_POINTS, MAX_FEATURES, MAX_KEYFRAMES = 5_000_000, 20_000, 100_000
 """More are no map of ours."""
-
-FEATURE = np.dtype([
-    ("normalised", "<f4", 2), ("octaves", "u1"), ("angles_deg", "<f4"), ("descriptors", "u1", 32),
-    ("point_ids", "<i4"), ("sharpness", "<f4"), ("refined", "u1"),
-])  # fmt: skip
-"""A feature of a keyframe; `sharpness` is its whitening relative to that of a detected corner.
-Of its pixels only the direction is kept: refined, and with the rotation during a readout undone."""
-POINT = np.dtype([
-    ("positions", "<f8", 3), ("covariance", "<f4", 6), ("descriptors", "u1", 32),
-    ("normals", "<f4", 3), ("base_distance", "<f8"), ("n_visible", "<i4"), ("n_found", "<i4"),
-    ("first_seen", "<i4"), ("first_unproject", "<f4", (2, 2)), ("patch_centre", "<f4", 2),
-    ("patch_level", "i1"), ("patch_grey", "u1", (STORED, STORED)),
-])  # fmt: skip
-UPPER = np.triu_indices(3)
 SCHEMA = f"""
 PRAGMA application_id = {APPLICATION_ID};
 PRAGMA user_version = {VERSION};
@@ -88,19 +76,6 @@ class ReadSiteMap:
     damaged: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SiteHead:
-    """Head of a file: its account of the map as a whole."""
-
-    revision: int
-    parts: tuple[SitePart, ...]
-    georeference: SiteGeoreference
-    n_keyframes: int
-    n_points: int
-    scale_factor: float
-    n_levels: int
-
-
 def map_path(given: str | Path) -> Path:
     """The site map that a file, or the folder of a run, stands for."""
     path = Path(given).expanduser()
@@ -118,14 +93,15 @@ def write_site_map(path: Path, site: SiteMap) -> None:
             file.execute("PRAGMA synchronous = OFF")
             file.executescript(SCHEMA)
             file.execute("BEGIN")
-            file.execute("INSERT INTO head VALUES (0, ?, ?)", _signed(_head_json(site)))
+            file.execute("INSERT INTO head VALUES (0, ?, ?)", _signed(head_json(site)))
             for n, each in enumerate(site.parts):
-                file.execute("INSERT INTO part VALUES (?, ?, ?)", (n, *_signed(_part_json(each))))
+                file.execute("INSERT INTO part VALUES (?, ?, ?)", (n, *_signed(part_json(each))))
             for key, which in zip(site.keyframes, site.part_of.tolist(), strict=True):
-                text, data = _keyframe_json(key), _feature_rows(key).tobytes()
+                text, data = keyframe_json(key), feature_rows(key).tobytes()
                 row = (key.keyframe_id, which, text, data, _digest(which, text, data))
                 file.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?, ?)", row)
-            for first, data in _blocks(site):
+            for first in range(0, len(site.points.positions), BLOCK):
+                data = point_rows(site, slice(first, first + BLOCK)).tobytes()
                 block = (first, data, _digest(first, data))
                 file.execute("INSERT INTO points VALUES (?, ?, ?)", block)
             file.execute("COMMIT")
@@ -174,11 +150,10 @@ def read_site_map(path: Path) -> ReadSiteMap:
     for keyframe in keyframes:  # what observes a point of a lost block observes none
         ids = keyframe.point_ids
         ids[(ids >= 0) & lost[ids]] = -1
-    covariance = np.zeros((len(rows), 3, 3))
-    covariance[:, UPPER[0], UPPER[1]] = covariance[:, UPPER[1], UPPER[0]] = rows["covariance"]
     site = SiteMap(
         head.revision, head.parts, tuple(keyframes), np.array(part_of, np.int64),
-        _point_arrays(rows), covariance, head.georeference, head.scale_factor, head.n_levels,
+        point_arrays(rows), covariances_of(rows), head.georeference,
+        head.scale_factor, head.n_levels,
     )  # fmt: skip
     return ReadSiteMap(site, tuple(damaged))
 
@@ -196,63 +171,6 @@ def _digest(*parts: int | str | bytes) -> bytes:
 
 def _signed(text: str) -> tuple[str, bytes]:
     return text, _digest(text)
-
-
-def _head_json(site: SiteMap) -> str:
-    found, origin = site.georeference, site.georeference.origin
-    return json.dumps({
-        "revision": site.revision, "n_parts": len(site.parts), "n_keyframes": len(site.keyframes),
-        "n_points": len(site.points.positions), "scale_factor": site.scale_factor,
-        "n_levels": site.n_levels, "origin": None if origin is None else [
-            origin.latitude_deg, origin.longitude_deg, origin.altitude_m
-        ],
-        "sigma_m": found.sigma_m, "sigma_yaw_rad": found.sigma_yaw_rad,
-        "sigma_scale": found.sigma_scale, "method": found.method,
-    }, sort_keys=True)  # fmt: skip
-
-
-def _part_json(part: SitePart) -> str:
-    camera, mount = part.camera, part.camera.body_from_camera
-    return json.dumps({
-        "flight": part.flight, "began_ns": part.began_ns, "revision": part.revision,
-        "image": [camera.width, camera.height],
-        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-        "distortion": camera.distortion.value, "coefficients": list(camera.coefficients),
-        "body_from_camera": None if mount is None else mount.matrix().tolist(),
-        "assumed": camera.assumed, "readout_ms": camera.readout_ms,
-    }, sort_keys=True)  # fmt: skip
-
-
-def _keyframe_json(keyframe: Keyframe) -> str:
-    attitude = keyframe.ned_from_camera
-    return json.dumps({
-        "t_ns": keyframe.t_ns, "seq": keyframe.seq,
-        "camera_from_world": keyframe.camera_from_map.matrix()[:3].tolist(),
-        "ned_from_camera": None if attitude is None else attitude.tolist(),
-    }, sort_keys=True)  # fmt: skip
-
-
-def _feature_rows(keyframe: Keyframe) -> NDArray[np.void]:
-    features = keyframe.features
-    rows = np.zeros(len(features), FEATURE)
-    for name in ("octaves", "angles_deg", "descriptors"):
-        rows[name] = getattr(features, name)
-    rows["point_ids"], rows["normalised"] = keyframe.point_ids, keyframe.normalised
-    # refinement changes the size of a whitening only
-    rows["sharpness"] = keyframe.whitening[:, 0, 0] / features.whitening[:, 0, 0]
-    rows["refined"] = keyframe.refined_for >= 0
-    return rows
-
-
-def _blocks(site: SiteMap) -> Iterator[tuple[int, bytes]]:
-    for first in range(0, len(site.points.positions), BLOCK):
-        own = slice(first, first + BLOCK)
-        rows = np.zeros(len(site.points.positions[own]), POINT)
-        for name in PointArrays._fields:
-            if name != "born":
-                rows[name] = getattr(site.points, name)[own]
-        rows["covariance"] = site.covariances[own, UPPER[0], UPPER[1]]
-        yield first, rows.tobytes()
 
 
 # -- reading -------------------------------------------------------------------------------------
@@ -286,16 +204,8 @@ def _head_of(path: Path, file: sqlite3.Connection) -> SiteHead:
         parts = []
         for n in range(int(head["n_parts"])):
             row = file.execute("SELECT json, digest FROM part WHERE id = ?", (n,)).fetchone()
-            parts.append(_part(json.loads(_checked(row))))
-        origin = None if head["origin"] is None else GeoOrigin(*map(float, head["origin"]))
-        found = SiteGeoreference(
-            origin, float(head["sigma_m"]), float(head["sigma_yaw_rad"]),
-            float(head["sigma_scale"]), str(head["method"]),
-        )  # fmt: skip
-        out = SiteHead(
-            int(head["revision"]), tuple(parts), found, int(head["n_keyframes"]),
-            int(head["n_points"]), float(head["scale_factor"]), int(head["n_levels"]),
-        )  # fmt: skip
+            parts.append(site_part_of(json.loads(_checked(row))))
+        out = head_of(head, tuple(parts))
     except (sqlite3.Error, ValueError, KeyError, TypeError, IndexError) as error:
         raise SiteMapError(f"{path}: its head is damaged ({error})") from error
     within = 0 < out.n_keyframes <= MAX_KEYFRAMES and 0 <= out.n_points <= MAX_POINTS
@@ -308,19 +218,6 @@ def _checked(row: Any) -> str:
     if row is None or _digest(row[0]) != row[1]:
         raise ValueError("a row is missing, or its digest is not its own")
     return str(row[0])
-
-
-def _part(said: dict[str, Any]) -> SitePart:
-    mount = said["body_from_camera"]
-    width, height = said["image"]
-    fx, fy, cx, cy = said["intrinsics"]
-    camera = Camera(
-        width, height, fx, fy, cx, cy, Distortion(said["distortion"]),
-        tuple(said["coefficients"]),
-        None if mount is None else Pose.from_matrix(np.array(mount)), said["assumed"],
-        said.get("readout_ms"),
-    )  # fmt: skip
-    return SitePart(said["flight"], said["began_ns"], camera, said["revision"])
 
 
 def _row(file: sqlite3.Connection, query: str, key: int) -> Any:
@@ -343,16 +240,6 @@ def _points(file: sqlite3.Connection, head: SiteHead, damaged: list[str]) -> NDA
     return rows
 
 
-def _point_arrays(rows: NDArray[np.void]) -> PointArrays:
-    wider: dict[str, Any] = {"i": np.int64, "f": np.float64, "u": np.uint8}
-    values = {
-        name: rows[name].astype(wider[rows[name].dtype.kind])
-        for name in PointArrays._fields
-        if name != "born"
-    }
-    return PointArrays(**values, born=np.full(len(rows), BORN_EARLIER, np.int64))
-
-
 def _keyframe(
     file: sqlite3.Connection, key: int, head: SiteHead, n_points: int
 ) -> tuple[Keyframe, int] | None:
@@ -361,25 +248,9 @@ def _keyframe(
     row = _row(file, query, key)
     if row is None or _digest(*row[:3]) != row[3] or len(row[2]) % FEATURE.itemsize:
         return None
-    part, said = row[0], json.loads(row[1])
-    rows = np.frombuffer(row[2], FEATURE)
+    part, said, rows = row[0], json.loads(row[1]), np.frombuffer(row[2], FEATURE)
     if not 0 <= part < len(head.parts) or not 0 < len(rows) <= MAX_FEATURES:
         return None
-    camera = head.parts[part].camera
-    point_ids = rows["point_ids"].astype(np.int64)
-    if point_ids.max() >= n_points:
+    if rows["point_ids"].max() >= n_points:
         return None
-    normalised: Array = rows["normalised"].astype(np.float64)
-    features = features_of(
-        camera, head.scale_factor, pixels_of(camera, normalised), normalised.copy(),
-        rows["octaves"].astype(np.int64), rows["angles_deg"].copy(), rows["descriptors"].copy(),
-    )  # fmt: skip
-    refined = rows["refined"] > 0
-    whitening = features.whitening * rows["sharpness"][:, None, None].astype(np.float64)
-    attitude = said["ned_from_camera"]
-    return Keyframe(
-        key, said["seq"], said["t_ns"],
-        Pose.from_matrix(np.vstack([said["camera_from_world"], [0.0, 0.0, 0.0, 1.0]])), features,
-        point_ids, normalised, whitening, np.where(refined, point_ids, -1),
-        ned_from_camera=None if attitude is None else np.array(attitude),
-    ), part  # fmt: skip
+    return keyframe_of(key, said, rows, head.parts[part].camera, head.scale_factor), part

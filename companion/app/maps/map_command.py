@@ -19,12 +19,12 @@ from companion.products.cloud_ply import ply_parts
 from companion.products.flight_result import WorldPose
 from companion.products.site_map_file import (
     ReadSiteMap,
-    SiteHead,
     map_path,
     read_head,
     read_site_map,
     write_site_map,
 )
+from companion.products.site_map_rows import SiteHead
 from companion.products.trajectory_file import trajectory_tum
 from companion.slam.map.site_map import SiteMap
 from companion.slam.mapping.site_merge import merge_sites
