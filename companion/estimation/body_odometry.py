@@ -33,7 +33,7 @@ class BodyOdometry:
 
     def begin(self, t_ns: int, stands: bool) -> Reckoned | None:
         """Go on to the next frame; see `SmoothOdometry.begin`."""
-        stands_at = self._georeferencer.newest_place if stands else None
+        stands_at = self._georeferencer.path.newest_place if stands else None
         return self._smooth.begin(t_ns, self._body_attitude(t_ns), stands, stands_at)
 
     def apply_map_correction(self) -> None:
@@ -54,7 +54,8 @@ class BodyOdometry:
 
         return self._motion.predicted(
             t_ns, attitude, self._georeferences.of(self._tracker.map),
-            None if reckoned is None else place_of, self._georeferencer.displacement_by_velocity,
+            None if reckoned is None else place_of,
+            self._georeferencer.path.displacement_by_velocity,
         )  # fmt: skip
 
     def of_track(self, track: Track) -> Odometry:

@@ -135,7 +135,7 @@ class LocalisationStage:
             self._georeferences, self._smooth,
         )  # fmt: skip
         self._tracker.atlas.loop_allowed = self._loop_allowed
-        self._georeferences.reckoned_at = self._smooth.reckoning.path.at
+        self._georeferences.begun.reckoned_at = self._smooth.reckoning.path.at
         self._tracker.atlas.displacements_of = self._georeferences.displacements_of
         self._site = SiteInFlight(site, self._tracker, self._georeferencer, self._georeferences)
 

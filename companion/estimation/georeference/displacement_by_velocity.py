@@ -48,7 +48,7 @@ def _displacements(
     georeferencer: Georeferencer, placed: Georeference, keyframes: list[Keyframe]
 ) -> DisplacementFactor | None:
     t_ns = np.array([k.t_ns for k in keyframes])
-    travelled_m = georeferencer.integrated_velocity(t_ns)
+    travelled_m = georeferencer.path.integrated_velocity(t_ns)
     if travelled_m is None:
         return None
     to_world, (rotation, _) = placed.world_from_map, _poses(keyframes)

@@ -16,6 +16,7 @@ from companion.config import GeoreferenceConfig
 from companion.estimation.georeference.alignment_sample import AlignmentSample, mean_rotation
 from companion.estimation.georeference.depth_verdict import DepthVerdict
 from companion.estimation.georeference.height_scales import HeightScales
+from companion.estimation.georeference.measured_path import MeasuredPath
 from companion.estimation.georeference.trajectory_alignment import (
     SIGMA_TILT_RAD,
     SIGMA_VELOCITY_M_S,
@@ -26,14 +27,10 @@ from companion.estimation.georeference.trajectory_alignment import (
     fit_map,
     reconciled,
 )
-from companion.estimation.georeference.velocity_verdict import VelocityVerdict
-from companion.estimation.sample_series import SampleSeries
 from companion.geometry.transforms import Array, Pose, Similarity, rotation_from_vector
 from companion.messages import Georeference, Warned
 from companion.telemetry import PositionSample, PositionSource, Telemetry
 
-MAX_VELOCITY_AGE_NS = 400_000_000
-"""A velocity is extrapolated for at most so long."""
 MAX_SIGMA_ROTATION_RAD = np.radians(8.0)
 MAX_SAMPLES = 400
 SIGMA_BEND_RAD = np.radians(0.1)
@@ -59,24 +56,16 @@ class Georeferencer:
         sensors_only: bool = False,
     ) -> None:
         self._config = config
-        self._sources = [PositionSource.GPS] if sensors_only else list(PositionSource)
         self._body_from_camera = body_from_camera
-        self._positions = {source: SampleSeries() for source in PositionSource}
-        self._velocity_integral = {source: SampleSeries() for source in PositionSource}
-        self._velocity = {source: VelocityVerdict() for source in PositionSource}
         self._warnings: list[Warned] = []
+        self.path = MeasuredPath(sensors_only, lambda warning: self._warnings.append(warning))
         self._depths = DepthVerdict()
         self._heights = HeightScales(config.min_travel_m, body_from_camera)
 
     def take(self, sample: Telemetry) -> None:
         """Add a sample; irrelevant ones are ignored."""
         if isinstance(sample, PositionSample):
-            self._positions[sample.source].add(sample.t_ns, sample.position_ned_m)
-            if sample.velocity_ned_m_s is not None:
-                integral = self._velocity_integral[sample.source]
-                self._integrate(integral, sample.t_ns, sample.velocity_ned_m_s)
-                if integral.newest is not None and integral.newest[0] == sample.t_ns:
-                    self._judge(sample, integral.newest[1][1])
+            self.path.take(sample)
         else:
             self._heights.take(sample)
 
@@ -88,75 +77,12 @@ class Georeferencer:
     def prune(self, before_ns: int, keyframes_ns: Array) -> None:
         """Drop samples before a time, except at the times of keyframes (N,), sorted."""
         self._heights.prune(before_ns, keyframes_ns)
-        for each in (*self._positions.values(), *self._velocity_integral.values()):
-            each.prune(before_ns, keyframes_ns)
-
-    @property
-    def newest_place(self) -> Array | None:
-        """Newest position (3,), NED metres, that may place a map; None before there is one."""
-        for source in self._sources:
-            newest = self._positions[source].newest
-            if newest is not None:
-                return np.asarray(newest[1])
-        return None
+        self.path.prune(before_ns, keyframes_ns)
 
     @property
     def has_ranges(self) -> bool:
         """True if there are enough ranges to compare with a map."""
         return self._heights.has_ranges
-
-    def _integrate(self, series: SampleSeries, t_ns: int, velocity: Array) -> None:
-        # rows: velocity and its integral; a GPS may lack the vertical component
-        if not series.takes(t_ns):
-            return
-        if series.newest is None:
-            series.add(t_ns, np.stack([velocity, 0.0 * velocity]), horizontal_only=True)
-            return
-        before_ns, (previous, travelled_m) = series.newest
-        dt = (t_ns - before_ns) * 1e-9
-        integrated_velocity = travelled_m + 0.5 * (previous + velocity) * dt
-        series.add(t_ns, np.stack([velocity, integrated_velocity]), horizontal_only=True)
-
-    def _judge(self, sample: PositionSample, travelled_m: Array) -> None:
-        verdict = self._velocity[sample.source]
-        change = verdict.take(sample.t_ns, sample.position_ned_m, travelled_m)
-        if change is not None and sample.source in self._sources:
-            self._warnings.append(replace(change, detail=f"{sample.source.value}: {change.detail}"))
-
-    def _integral_of(self, source: PositionSource) -> SampleSeries | None:
-        """Integrated velocity of a source; None where it is not believed."""
-        return self._velocity_integral[source] if self._velocity[source].believed else None
-
-    def displacement_between(self, from_ns: int, to_ns: int) -> Array | None:
-        """Measured displacement (3,), NED metres, between two times; None where unknown."""
-        for source in self._sources:
-            if len(self._positions[source]) >= 4:
-                where, ok = self._positions[source].at(np.array([from_ns, to_ns]))
-                if ok.all():
-                    return np.asarray(where[1] - where[0], np.float64)
-        return None
-
-    def place_at(self, t_ns: int) -> Array | None:
-        """Measured place (3,) of the body, NED metres; None where unknown."""
-        for source in self._sources:
-            if len(self._positions[source]) >= 4:
-                where, ok = self._positions[source].at(np.array([t_ns]))
-                if ok.all():
-                    return np.asarray(where[0], np.float64)
-        return None
-
-    def integrated_velocity(self, t_ns: Array) -> Array | None:
-        """Integrated velocity (N, 3) at times (N,), NED metres.
-
-        From one source; nan where missing. None where no source has any.
-        """
-        for source in self._sources:
-            series = self._integral_of(source)
-            if series is not None and len(series) >= 4:
-                value, ok = series.at(t_ns)
-                if np.count_nonzero(ok) > 1:
-                    return np.where(ok[:, None], value[:, 1], np.nan)
-        return None
 
     def lever_ned(self, ned_from_camera: Array) -> Array:
         """Lever arm from body to camera (N, 3), NED metres, for rotations (N, 3, 3)."""
@@ -164,26 +90,6 @@ class Georeferencer:
             return np.zeros((len(ned_from_camera), 3))
         mount = self._body_from_camera
         return np.asarray(ned_from_camera @ (mount.rotation.T @ mount.translation))
-
-    def displacement_by_velocity(self, from_ns: int, to_ns: int) -> Array | None:
-        """Displacement (3,) by velocity, NED metres; None where unknown.
-
-        Its down axis is nan where velocities are level ones, as some satellite receivers tell them.
-        Beyond the newest sample the last velocity is held for a while.
-        """
-        for source in self._sources:
-            series = self._integral_of(source)
-            if series is None or len(series) < 2 or series.newest is None:
-                continue
-            newest_ns, _ = series.newest
-            end_ns = min(to_ns, newest_ns)
-            if to_ns - newest_ns > MAX_VELOCITY_AGE_NS or from_ns > end_ns:
-                continue
-            (start, end), ok = series.at(np.array([from_ns, end_ns]))
-            if ok.all():
-                travelled_m = end[1] - start[1] + end[0] * ((to_ns - end_ns) * 1e-9)
-                return np.asarray(travelled_m, np.float64)
-        return None
 
     def solve(
         self, samples: list[AlignmentSample], inertial: Scale | None = None,
@@ -226,8 +132,8 @@ class Georeferencer:
         self, samples: list[AlignmentSample], level: Level | None, prior: Scale | None
     ) -> Georeference | None:
         """Georeference by the first source of positions that gives one."""
-        for source in self._sources:
-            if len(self._positions[source]) >= 4:
+        for source in self.path.sources:
+            if len(self.path.positions[source]) >= 4:
                 found = self._from_positions(samples, level, source, prior)
                 if found is not None:
                     return found
@@ -239,7 +145,7 @@ class Georeferencer:
         With its standard deviation, and the name of the method; None where unknown.
         """
         first_ns, last_ns = samples[0].t_ns, samples[-1].t_ns
-        displacement_m = self.displacement_by_velocity(first_ns, last_ns)
+        displacement_m = self.path.displacement_by_velocity(first_ns, last_ns)
         if displacement_m is None:
             return None
         way_s = (last_ns - first_ns) * 1e-9
@@ -266,9 +172,9 @@ class Georeferencer:
         prior: Scale | None,
     ) -> Georeference | None:  # fmt: skip
         t_ns = np.array([p.t_ns for p in samples])
-        measured, ok = self._positions[source].at(t_ns)
+        measured, ok = self.path.positions[source].at(t_ns)
         travelled_m = np.full((len(samples), 3), np.nan)
-        series = self._integral_of(source)
+        series = self.path.integral_of(source)
         if series is not None and len(series) >= 4:
             integrated_velocity, near = series.at(t_ns)
             travelled_m[near] = integrated_velocity[near, 1]

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 
 import numpy as np
 
 from companion.estimation.attitude.camera_attitude import CameraAttitude
-from companion.estimation.body.reckoned_path import BodyPlace
-from companion.estimation.georeference.alignment_sample import AlignmentSample
+from companion.estimation.georeference.begun_segments import BegunSegments
 from companion.estimation.georeference.depth_scales import DepthScales
 from companion.estimation.georeference.displacement_by_velocity import displacement_factor
 from companion.estimation.georeference.georeferencer import Georeferencer, place_new_map
-from companion.estimation.georeference.height_above_ground import HeightAboveGround
 from companion.estimation.georeference.inertial_scale import InertialScale, settled
+from companion.estimation.georeference.segment_samples import SegmentSamples
 from companion.estimation.georeference.tracked_places import TrackedPlaces
 from companion.estimation.georeference.trajectory_alignment import DISAGREE, Scale
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
@@ -35,8 +34,6 @@ MAX_TOLD_WHOLE, N_TOLD = 1000, 400
 about the newest observe: each keyframe tells them again, to all who listen."""
 MAX_COMPARED = 2000
 """Newest keyframes whose displacements say how well the velocity fits."""
-MAX_GROUND_DISTANCES = 40
-"""Half a millisecond each, on the way to a pose; their median is no more certain of more."""
 SETTLED_AFTER = 2
 """Keyframes after which one has been adjusted, and so the frames before it are placed well."""
 
@@ -69,10 +66,8 @@ class SegmentGeoreferences:
         """By first keyframe of a segment."""
         self._places = TrackedPlaces()
         self.depths = DepthScales()
-        self.reckoned_at: Callable[[int], BodyPlace | None] = lambda _t_ns: None
-        """Place of the body by inertial navigation at a recent frame."""
-        self._reckoned: dict[int, tuple[BodyPlace, Georeference | None]] = {}
-        """Place at which a segment began by it, and the segment so placed, by first keyframe."""
+        self._samples = SegmentSamples(georeferencer, attitude, body_from_camera)
+        self.begun = BegunSegments(georeferencer, self._samples)
 
     def of(self, segment: SlamMap) -> Georeference | None:
         """Georeference of a segment; None until known."""
@@ -144,7 +139,7 @@ class SegmentGeoreferences:
                 continue
             if final or (segment is segments[-1] and _due(segment)):
                 found = self._georeferencer.solve(
-                    self._samples(
+                    self._samples.of(
                         segment,
                         segment.spread_keyframes(MAX_SAMPLES_FINAL if final else MAX_SAMPLES),
                     ),
@@ -200,7 +195,7 @@ class SegmentGeoreferences:
             return None
         key, table = segment.first_keyframe_id, segment.poses()
         first = next(iter(segment.keyframes.values()))
-        begun = self._begun_by_navigation(segment, first)
+        begun = self.begun.of(segment, first)
         start = None if begun is None else begun[0].start
         lever_m = mount.rotation.T @ mount.translation
         turned, delay_ns = self._attitude.correction[0], self._attitude.imu_delay_ns
@@ -227,9 +222,7 @@ class SegmentGeoreferences:
         """Take back what accelerations since a time gave; scales begin anew with those before."""
         self._by_acceleration.withdraw(since_ns, self._known)
         self._inertial.clear()
-        late = [k for k, (start, _) in self._reckoned.items() if start.t_ns >= since_ns]
-        for key in late:
-            del self._reckoned[key]
+        self.begun.withdraw(since_ns)
 
     def displacements_of(
         self, segment: SlamMap, keyframes: list[Keyframe]
@@ -266,13 +259,13 @@ class SegmentGeoreferences:
         `own` gives its scale without an origin, or None.
         """
         first = next(iter(segment.keyframes.values()))
-        begun = self._begun_by_navigation(segment, first)
+        begun = self.begun.of(segment, first)
         if begun is not None:
             body, placed = begun
             own = own or placed
             if own is None:
                 return None
-            (lever_m,) = self._georeferencer.levers_of(self._samples(segment, [first]))
+            (lever_m,) = self._georeferencer.levers_of(self._samples.of(segment, [first]))
             start_ned_m = body.place_world_m + lever_m
             return _beginning_at(own, first, start_ned_m)
         before = [
@@ -285,41 +278,16 @@ class SegmentGeoreferences:
         if not before:
             return None
         since_ns, from_ned_m = max(before, key=lambda place: place[0])
-        displacement_m = self._georeferencer.displacement_by_velocity(since_ns, first.t_ns)
+        displacement_m = self._georeferencer.path.displacement_by_velocity(since_ns, first.t_ns)
         if displacement_m is None:
             return None
         # an unknown climb is taken as none: it is where the map lies, not how large it is
         start_ned_m = from_ned_m + np.nan_to_num(displacement_m)
         if own is None:
-            samples = self._samples(segment, list(segment.keyframes.values()))
+            samples = self._samples.of(segment, list(segment.keyframes.values()))
             travelled = self._georeferencer.travelled(samples)
             return None if travelled is None else place_new_map(samples, start_ned_m, *travelled)
         return _beginning_at(own, first, start_ned_m)
-
-    def _begun_by_navigation(
-        self, segment: SlamMap, first: Keyframe
-    ) -> tuple[BodyPlace, Georeference | None] | None:
-        """Place of the body by inertial navigation as a segment began, and the segment so placed.
-
-        Found once, while the navigation does not go by this segment.
-        """
-        key = segment.first_keyframe_id
-        if key not in self._reckoned:
-            if first.keyframe_id != key:
-                return None  # a later one that is left may have aided the navigation
-            last = max(segment.keyframes.values(), key=lambda k: k.t_ns)
-            start, end = self.reckoned_at(first.t_ns), self.reckoned_at(last.t_ns)
-            if start is None or end is None or last is first:
-                return None
-            samples = self._samples(segment, [first, last])
-            levers = self._georeferencer.levers_of(samples)
-            moved_m = end.place_world_m + levers[1] - start.place_world_m - levers[0]
-            sigma_m_s = float(np.sqrt(np.diag(end.start.covariance)[:3].max()))
-            sigma_m = sigma_m_s * (last.t_ns - first.t_ns) * 1e-9
-            from_m = start.place_world_m + levers[0]
-            placed = place_new_map(samples, from_m, moved_m, sigma_m, "accelerometers")
-            self._reckoned[key] = start, placed
-        return self._reckoned[key]
 
     def loop_allowed(
         self, segment: SlamMap, keyframe: Keyframe, other: Keyframe, found: LoopClosure
@@ -334,39 +302,13 @@ class SegmentGeoreferences:
             return True
         displacement = found.here_from_there.apply(other.centre) - keyframe.centre
         displacement_m = placed.world_from_map.scale * placed.world_from_map.rotation @ displacement
-        measured_m = self._georeferencer.displacement_between(keyframe.t_ns, other.t_ns)
+        measured_m = self._georeferencer.path.displacement_between(keyframe.t_ns, other.t_ns)
         if measured_m is None:
             return True
         off_m = float(np.linalg.norm(displacement_m - measured_m))
         return off_m < MAX_LOOP_ERROR_M + 3.0 * placed.sigma_scale * float(
             np.linalg.norm(displacement_m)
         )
-
-    def _samples(self, segment: SlamMap, keyframes: list[Keyframe]) -> list[AlignmentSample]:
-        poses = [k.camera_from_map.inverse() for k in keyframes]
-        ground_distances = self._ground_distances(segment, poses)
-        return [
-            AlignmentSample(k.t_ns, pose, self._attitude.of_keyframe(k.keyframe_id, k.t_ns), ground)
-            for k, pose, ground in zip(keyframes, poses, ground_distances, strict=True)
-        ]
-
-    def _ground_distances(self, segment: SlamMap, poses: list[Pose]) -> list[float | None]:
-        """Distances from cameras `map_from_camera` along the body axis to the ground, map units.
-
-        None where unknown: without rangefinder, or with a gimbal.
-        """
-        mount = self._body_from_camera
-        asked = self._georeferencer.has_ranges and self._attitude.used
-        if mount is None or not poses or not asked:
-            return [None] * len(poses)
-        beams = [pose.rotation @ mount.rotation[2] for pose in poses]
-        down = np.sum(beams, axis=0)
-        ground = HeightAboveGround(segment.point_positions(), down / np.linalg.norm(down))
-        compared = set(np.linspace(0, len(poses) - 1, MAX_GROUND_DISTANCES).astype(int).tolist())
-        return [
-            ground.distance(pose.translation, beam) if i in compared else None
-            for i, (pose, beam) in enumerate(zip(poses, beams, strict=True))
-        ]
 
 
 def _beginning_at(own: Georeference, first: Keyframe, start_ned_m: Array) -> Georeference:

@@ -56,7 +56,7 @@ class SiteInFlight:
             return None
         return self._use.allowed(
             found, self._georeferences.of(self._tracker.map),
-            self._georeferencer.place_at(found.keyframe.t_ns),
+            self._georeferencer.path.place_at(found.keyframe.t_ns),
         )  # fmt: skip
 
     def frame(self, t_ns: int, map_from_camera: Pose | None) -> Iterator[Warned]:
@@ -84,7 +84,7 @@ class SiteInFlight:
         if self._place is not None and t_ns - self._place[0] >= COMPARE_EVERY_NS:
             at_ns, place_m = self._place
             self._place = None
-            if use.compare(place_m, self._georeferencer.place_at(at_ns)):
+            if use.compare(place_m, self._georeferencer.path.place_at(at_ns)):
                 self._georeferences.give_up_place()
         placed = self._georeferences.of(self._tracker.map)
         if self._place is None and placed is not None and map_from_camera is not None:
