@@ -25,14 +25,7 @@ from companion.telemetry import ArmedSample, LandedSample, Telemetry
 from companion.timing.clock import FlightClock
 from companion.timing.link_clock import ClockFilter
 from drivers.mavlink.clock_exchange import ClockExchange
-from drivers.mavlink.commands import (
-    AUTOPILOT,
-    REFUSALS,
-    TRIES,
-    Commands,
-    command_at,
-    command_long,
-)
+from drivers.mavlink.commands import ANSWER_S, AUTOPILOT, REFUSALS, Commands
 from drivers.mavlink.other_companion import OtherCompanion
 from drivers.mavlink.rate_requests import RateRequests
 from drivers.mavlink.status_text import TextLimit, status_text
@@ -48,15 +41,12 @@ FIRST_SYSTEM = 1
 """System id that we use until the vehicle is heard: on UDP it may send only then."""
 HEARTBEAT_NS, HEARTBEAT_TICK_S = 1_000_000_000, 0.05
 WATCH_S, ORIGIN_S = 0.1, 5.0
-ANSWER_S, REQUEST_S = 1.0, 0.4
+REQUEST_S = 0.4
 TIMESYNC_S = 0.1
 """Interval of requests, as PX4's own."""
 COUNTED = {
-    *READERS,
-    *GIMBAL_IDS,
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT,
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
-}
+    *READERS, *GIMBAL_IDS, mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+}  # fmt: skip
 
 Take = Callable[[Any, int], None]
 
@@ -85,7 +75,7 @@ class AutopilotLink:
         self._meter = SourceMeter("autopilot")
         self._rates: defaultdict[str, RateMeter] = defaultdict(RateMeter)
         self._requests = RateRequests(config, port, clock, warn, self._request_rate, on_gimbal)
-        self._commands = Commands(self.send)
+        self.commands = Commands(self.send, self._target)
         self._text_limit = TextLimit()
         self.system_status: int = mavlink.MAV_STATE_BOOT
         """MAV_STATE of our HEARTBEAT."""
@@ -177,26 +167,6 @@ class AutopilotLink:
             self.send(status_text(each))
         return bool(said)
 
-    async def command(
-        self, command: int, *params: float, timeout_s: float = ANSWER_S, tries: int = TRIES
-    ) -> int:
-        """Send a COMMAND_LONG until acknowledged: a MAV_RESULT, or NO_ANSWER (-1)."""
-        system = self._target()
-
-        def make(attempt: int) -> Any:
-            return command_long(system, command, attempt, *params)
-
-        return await self._commands.ask(command, make, timeout_s, tries)
-
-    async def command_at(self, command: int, place: GeoOrigin) -> int:
-        """Send a COMMAND_INT for a geodetic position, altitude above mean sea level; likewise."""
-        message = command_at(self._target(), command, place)
-        return await self._commands.ask(command, lambda _attempt: message, ANSWER_S, TRIES)
-
-    async def set_source_set(self, number: int) -> int:
-        """Fly on a source set of ArduPilot's EKF3 (EK3_SRC1_… is 1): likewise."""
-        return await self.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, float(number))
-
     async def request_message(self, message_id: int) -> Any | None:
         """Request a message that is not streamed; None if it does not come."""
         came: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
@@ -207,7 +177,7 @@ class AutopilotLink:
 
         end = self.listen(message_id, take)
         try:
-            result = await self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
+            result = await self.commands.long(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
             if result in REFUSALS and not came.done():
                 return None
             with contextlib.suppress(asyncio.TimeoutError):
@@ -289,7 +259,7 @@ class AutopilotLink:
         self._deliver(LandedSample(receive_ns, landed(message)))
 
     def _take_acknowledgement(self, message: Any, _receive_ns: int) -> None:
-        self._commands.answered(message, self.port.identity)
+        self.commands.answered(message, self.port.identity)
 
     def _rebooted(self, now_ns: int) -> None:
         self._n_reboots = self.clock_filter.n_reboots
@@ -330,7 +300,7 @@ class AutopilotLink:
                 self._warn(Warned(now_ns, "autopilot silent", detail))
 
     async def _request_rate(self, message_id: int, interval_us: float) -> int:
-        return await self.command(
+        return await self.commands.long(
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us,
             timeout_s=REQUEST_S, tries=2,
         )  # fmt: skip

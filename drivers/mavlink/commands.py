@@ -17,6 +17,7 @@ REFUSALS = (
     mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED,
 )  # fmt: skip
 TRIES = 3
+ANSWER_S = 1.0
 MOST_PATIENCE_S = 30.0
 """Longest wait after an acknowledgement "in progress"."""
 
@@ -47,15 +48,34 @@ def source_set_command(system: int, number: int) -> Any:
 
 
 class Commands:
-    """Commands not acknowledged yet."""
+    """Commands to the autopilot of a system, which `target` tells; of a kind one at a time."""
 
-    def __init__(self, send: Callable[[Any], None]) -> None:
-        self._send = send
+    def __init__(self, send: Callable[[Any], None], target: Callable[[], int]) -> None:
+        self._send, self._target = send, target
         self._turns: dict[int, asyncio.Lock] = {}
         self._answers: dict[int, asyncio.Queue[int]] = {}
 
-    async def ask(self, command: int, make: MakeCommand, timeout_s: float, tries: int) -> int:
-        """MAV_RESULT of a command, or NO_ANSWER."""
+    async def long(
+        self, command: int, *params: float, timeout_s: float = ANSWER_S, tries: int = TRIES
+    ) -> int:
+        """Send a COMMAND_LONG until acknowledged: a MAV_RESULT, or NO_ANSWER."""
+        system = self._target()
+
+        def make(attempt: int) -> Any:
+            return command_long(system, command, attempt, *params)
+
+        return await self._ask(command, make, timeout_s, tries)
+
+    async def at(self, command: int, place: GeoOrigin) -> int:
+        """Send a COMMAND_INT for a geodetic position, altitude above mean sea level; likewise."""
+        message = command_at(self._target(), command, place)
+        return await self._ask(command, lambda _attempt: message, ANSWER_S, TRIES)
+
+    async def set_source_set(self, number: int) -> int:
+        """Fly on a source set of ArduPilot's EKF3 (EK3_SRC1_… is 1): likewise."""
+        return await self.long(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, float(number))
+
+    async def _ask(self, command: int, make: MakeCommand, timeout_s: float, tries: int) -> int:
         async with self._turns.setdefault(command, asyncio.Lock()):
             answers: asyncio.Queue[int] = asyncio.Queue(maxsize=8)
             self._answers[command] = answers

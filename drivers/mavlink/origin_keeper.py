@@ -70,7 +70,7 @@ class OriginKeeper:
             self._say(
                 "feedback.origin_latitude_deg is not set: the autopilot's map has it at 0 N 0 E"
             )
-        await self._link.command_at(DO_SET_GLOBAL_ORIGIN, place)
+        await self._link.commands.at(DO_SET_GLOBAL_ORIGIN, place)
         vehicle = self._link.vehicle
         self._link.send(
             mavlink.MAVLink_set_gps_global_origin_message(

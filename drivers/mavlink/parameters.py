@@ -76,7 +76,7 @@ class Parameters:
         self._unknown: set[str] = set()
         self._came = asyncio.Event()
         self._slowest_s: float | None = None
-        self._commands = Commands(link.send)
+        self._commands = Commands(link.send, lambda: self._system)
         link.listen(mavlink.MAVLINK_MSG_ID_COMMAND_ACK, self._take_acknowledgement)
         link.listen(mavlink.MAVLINK_MSG_ID_PARAM_VALUE, self._take_value)
         link.listen(mavlink.MAVLINK_MSG_ID_PARAM_ERROR, self._take_error)
@@ -124,15 +124,8 @@ class Parameters:
         """
         if self._firmware != "px4":
             return
-
-        def make(attempt: int) -> Any:
-            return mavlink.MAVLink_command_long_message(
-                self._system, AUTOPILOT, mavlink.MAV_CMD_PREFLIGHT_STORAGE, attempt,
-                STORE, NEITHER, 0.0, 0.0, 0.0, 0.0, 0.0,
-            )  # fmt: skip
-
-        result = await self._commands.ask(
-            mavlink.MAV_CMD_PREFLIGHT_STORAGE, make, MOST_ANSWERS_S, TRIES
+        result = await self._commands.long(
+            mavlink.MAV_CMD_PREFLIGHT_STORAGE, STORE, NEITHER, timeout_s=MOST_ANSWERS_S, tries=TRIES
         )
         if result != mavlink.MAV_RESULT_ACCEPTED:
             raise SourceError("the autopilot does not say that it has stored its parameters")

@@ -90,7 +90,7 @@ class SourceSwitch(Sender):
             self._journal.step(ASKED, now_ns, asked, sent=number is not None)
         if number is None:
             return
-        result = await self._link.set_source_set(number)
+        result = await self._link.commands.set_source_set(number)
         now_ns = self._clock.now_ns()
         accepted = None if result < 0 else result == ACCEPTED
         self._choice.answered(to_vision, accepted, now_ns)

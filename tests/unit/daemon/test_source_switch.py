@@ -247,7 +247,7 @@ def test_a_command_without_answer_may_have_been_obeyed(monkeypatch: pytest.Monke
             return -1
 
         with monkeypatch.context() as patch:
-            patch.setattr(vehicle.link, "set_source_set", unanswered)
+            patch.setattr(vehicle.link.commands, "set_source_set", unanswered)
             vehicle.switch.doubt_satellites(True)
             await vehicle.step()
         vehicle.switch.doubt_satellites(False)

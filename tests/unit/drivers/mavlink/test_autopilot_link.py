@@ -462,7 +462,7 @@ def test_commands_on_a_wire_that_loses_a_third() -> None:
             async with linked(autopilot) as heard:
                 autopilot.loss = 0.33
                 arm = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
-                result = await heard.link.command(arm, 1, timeout_s=0.05, tries=40)
+                result = await heard.link.commands.long(arm, 1, timeout_s=0.05, tries=40)
                 assert result == mavlink.MAV_RESULT_ACCEPTED and autopilot.armed
                 autopilot.loss = 0.0
                 await heard.until(lambda: ArmedSample in map(type, heard.samples))
@@ -472,7 +472,7 @@ def test_commands_on_a_wire_that_loses_a_third() -> None:
                 assert home.latitude == round(HERE.latitude_deg * 1e7)
                 assert await heard.link.request_message(9999) is None
                 place = GeoOrigin(47.1234567, 8.7654321, 432.1)
-                assert await heard.link.command_at(611, place) == mavlink.MAV_RESULT_ACCEPTED
+                assert await heard.link.commands.at(611, place) == mavlink.MAV_RESULT_ACCEPTED
                 assert autopilot.origin is not None
                 assert autopilot.origin.latitude_deg == pytest.approx(47.1234567, abs=1e-7)
 
@@ -753,13 +753,13 @@ def test_of_two_attitudes_the_more_frequent_is_taken() -> None:
 def test_commands_are_repeated_and_answers_to_others_ignored() -> None:
     async def test() -> None:
         async with spoken() as (heard, port, talk):
-            asking = asyncio.create_task(heard.link.command(400, 1, timeout_s=0.05, tries=3))
+            asking = asyncio.create_task(heard.link.commands.long(400, 1, timeout_s=0.05, tries=3))
             await asyncio.sleep(0.02)
             talk.say(mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 255, 190), 0.1)
             talk.say(mavlink.MAVLink_command_ack_message(401, 0), 0.1)
             assert await asking == NO_ANSWER
             assert [each.confirmation for each in port.of("COMMAND_LONG")][-3:] == [0, 1, 2]
-            asking = asyncio.create_task(heard.link.command(400, 1, timeout_s=0.3, tries=1))
+            asking = asyncio.create_task(heard.link.commands.long(400, 1, timeout_s=0.3, tries=1))
             await asyncio.sleep(0)  # it has asked
             talk.say(mavlink.MAVLink_command_ack_message(400, 5, 10, 0, 1, 197), 0.2)
             await asyncio.sleep(0.6)  # longer than it would have been waited for

@@ -36,7 +36,11 @@ class Link:
         self.looked += 1
         return None
 
-    async def command_at(self, _command: int, place: GeoOrigin) -> None:
+    @property
+    def commands(self) -> Any:
+        return self
+
+    async def at(self, _command: int, place: GeoOrigin) -> None:
         self.given.append(place)
 
     def send(self, _message: Any) -> None:
