@@ -18,11 +18,12 @@ from companion.daemon.component_state import POWEROFF
 from companion.daemon.control.armed_settings import NOT_KEPT
 from companion.daemon.control.ground_control import GroundControl
 from companion.daemon.control.settings_in_force import SettingsInForce
+from companion.daemon.flight_outputs import FlightOutputs
 from companion.daemon.flight_starts import NOT_BEGUN, FlightStarts
 from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.flight_facts import facts_of
 from companion.daemon.flights.flights import Flights
-from companion.daemon.flights.live_flight import Given, Listener, LiveFlight
+from companion.daemon.flights.live_flight import LiveFlight
 from companion.daemon.flights.recording_recovery import RecordingRecovery
 from companion.daemon.health_watch import HealthWatch
 from companion.daemon.link_watch import LinkWatch
@@ -36,16 +37,12 @@ from companion.daemon.stop_request import StopRequest
 from companion.daemon.vehicle_reports import VehicleReports, flight_recording
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import (
-    NO_PICTURE,
     Frame,
-    Georeferenced,
-    Odometry,
     Warned,
 )
 from companion.messages.run_facts import RunFacts
 from companion.meters import LatencyMeter
 from companion.pilot_messages import PilotText, of_warning
-from companion.runtime.stage_protocol import ResultsWritten, Snapshot
 from companion.runtime.stage_start import Start
 from companion.telemetry import (
     ArmedSample,
@@ -70,7 +67,6 @@ if TYPE_CHECKING:
     from drivers.system.metrics import Metrics
 
 LEAST_WAIT_S = 0.005
-NOT_WRITTEN = "the results so far could not be written"
 WRITE_S = 0.2
 """Time to write the armed settings at the end."""
 END_S = 2.6
@@ -117,7 +113,9 @@ class Daemon:
         dates = FlightDates(
             clock, lambda: date.ahead_ns if date is not None else None, clock_is_set
         )
-        self._flights = flights = Flights(clock, journal, self._listener, self._facts, dates, start)
+        self._flights = flights = Flights(
+            clock, journal, lambda flight: self._outputs.listener(flight), self._facts, dates, start
+        )
         self._watch = watch = HealthWatch(
             config, clock, journal, self._feed, self._link, self._senders, flights, self._loop_delay
         )
@@ -137,6 +135,11 @@ class Daemon:
                 self._reports.questions(lambda: settings.config.feedback), settings.by_ground,
                 self._on_warned,
             )  # fmt: skip
+        self._outputs = FlightOutputs(
+            flights, starts, watch, self._senders,
+            self._reports if config.feedback.obstacle_distance else None, self._ground, journal,
+            clock, self._on_warned, self._soon,
+        )  # fmt: skip
         self._checks = PeriodicChecks(
             settings, clock, journal, self._service, self._feed, self._link, link_watch, flights,
             dates, watch, starts, self._stop,
@@ -266,55 +269,6 @@ class Daemon:
         if isinstance(sample, ArmedSample):
             self._starts.set_armed(sample.armed)
 
-    def _listener(self, flight: LiveFlight) -> Listener:
-        """Callbacks for the output of a flight, active while that flight is the current one."""
-
-        def current(take: Callable[[Any], None]) -> Callable[[Any], None]:
-            def later(message: Any) -> None:
-                if self._flights.current is flight:
-                    take(message)
-
-            return lambda message: self._soon(later, message)
-
-        to_senders = current(self._senders.take if self._senders is not None else _nothing)
-
-        def warned(warning: Warned) -> None:
-            self._on_warned(warning)
-            to_senders(warning)
-
-        reports = self._reports if self._settings.config.feedback.obstacle_distance else None
-        return Listener(
-            given=current(self._on_given),
-            warned=warned,
-            localisation_died=lambda: self._soon(self._starts.localisation_died, flight),
-            unusable=lambda why: self._soon(self._starts.stage_unusable, why),
-            results_written=self._on_results_written,
-            points_made=current(self._watch.points_made),
-            mapped=current(reports.take) if reports is not None else None,
-        )
-
-    def _on_given(self, message: Given) -> None:
-        """Take an output of the current flight's stages."""
-        if isinstance(message, Snapshot):
-            if self._ground is not None:
-                self._ground.snapshot_told(message)
-        elif isinstance(message, Georeferenced):
-            self._watch.take_georeference(message)
-            if self._ground is not None:
-                self._ground.way_back.take_georeference(message)
-        elif isinstance(message, Odometry) and message.seq < NO_PICTURE:
-            self._watch.take_odometry(message)
-            if self._ground is not None:
-                self._ground.way_back.take_odometry(message)
-        if self._senders is not None:
-            self._senders.take(message)
-
-    def _on_results_written(self, written: ResultsWritten) -> None:
-        if written.why_not:
-            self._on_warned(Warned(self._clock.now_ns(), NOT_WRITTEN, written.why_not))
-        else:
-            self._journal.say(f"results so far: {written.folder}")
-
     def _reconfigured(self, old: Config, config: Config) -> None:
         self._checks.reconfigure(old, config)
         self._watch.reconfigure(config)
@@ -356,10 +310,6 @@ class Daemon:
             self._loop.call_soon_threadsafe(call, *arguments)
         except RuntimeError:
             pass
-
-
-def _nothing(_message: object) -> None:
-    """Take a message that goes nowhere: there is no autopilot."""
 
 
 async def _run(load: Callable[[], Config], start: Start, source: SettingsSource) -> int:
