@@ -1,4 +1,4 @@
-"""What the stages of a flight give, passed on in the daemon to whom it concerns."""
+"""Outputs of a flight's stages, passed on in the daemon to whom they concern."""
 
 from __future__ import annotations
 

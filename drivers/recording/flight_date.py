@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from companion.products.atomic_file import write_atomically
 from drivers.recording.flights_folder import (
     STAMPED,
     flight_name,
@@ -34,15 +35,7 @@ class FlightDate:
 
 def write_date(flight: Path, date: FlightDate) -> None:
     """Write it into a flight's folder, atomically; OSError where impossible."""
-    document = {
-        "began_unix_s": date.began_unix_s, "correction_s": date.correction_s, "by": date.by,
-    }  # fmt: skip
-    part = flight / f".{FILE}.part"
-    with part.open("wb") as file:
-        file.write(json.dumps(document).encode() + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, flight / FILE)
+    write_atomically(flight / FILE, json.dumps(asdict(date)).encode() + b"\n", durable=True)
 
 
 def read_date(flight: Path) -> FlightDate | None:
