@@ -109,7 +109,7 @@ def schur_complement(
     information, `gradient` (P, 3) of the points; `by_point` are the observations of variable
     cameras, ordered by point.
     """
-    blocks = np.zeros((n_variable, n_variable, 6, 6))
+    reduction = np.zeros((6 * n_variable, 6 * n_variable))
     rhs_part, through = np.zeros((n_variable, 6)), np.empty((6, 3))
     most, start = 0, 0
     for i in range(len(by_point)):
@@ -145,16 +145,16 @@ def schur_complement(
             for j in range(n):
                 if cameras[j] < cameras[i]:
                     continue
-                block, other = blocks[cameras[i], cameras[j]], turned[j]
+                other, column = turned[j], 6 * cameras[j]
                 for k in range(6):
                     a, b, c = through[k, 0], through[k, 1], through[k, 2]
+                    row = reduction[6 * cameras[i] + k, column : column + 6]
                     for m in range(6):
-                        block[k, m] += a * other[0, m] + b * other[1, m] + c * other[2, m]
+                        row[m] += a * other[0, m] + b * other[1, m] + c * other[2, m]
         start = end
-    reduction = np.empty((6 * n_variable, 6 * n_variable))
     for i in range(6 * n_variable):
-        for k in range(i + 1):
-            reduction[k, i] = reduction[i, k] = blocks[k // 6, i // 6, k % 6, i % 6]
+        for k in range(i):
+            reduction[i, k] = reduction[k, i]
     return reduction, rhs_part.ravel()
 
 

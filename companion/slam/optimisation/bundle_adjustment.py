@@ -78,9 +78,9 @@ def adjust(
         damped = hpp + (damping * np.einsum("nii->ni", hpp) + 1e-9)[..., None] * np.eye(3)
         inverse = np.linalg.inv(damped)
         yield_point()
-        reduction, rhs_part = schur_complement(inverse, gp, hcp, b.camera, b.point, by_point, n_var)
+        schur, rhs = schur_complement(inverse, gp, hcp, b.camera, b.point, by_point, n_var)
         yield_point()
-        schur = -reduction
+        np.negative(schur, schur)
         for k in range(n_var):
             block = schur[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
             block += hcc[k] + np.diag(damping * np.diag(hcc[k]) + 1e-9)
@@ -89,18 +89,12 @@ def adjust(
             factor.add_normal_equations(
                 schur.reshape(n_var, 6, n_var, 6), gradient, rotation, translation
             )
-        rhs = rhs_part - gradient.ravel()
-        try:
-            # numpy's, as frames are tracked beside a large adjustment: SciPy's cho_factor holds
-            # the interpreter's lock throughout, 0.16 s for 450 keyframes
-            lower = np.linalg.cholesky(schur)
-        except np.linalg.LinAlgError:
+        steps = _solved(schur, rhs - gradient.ravel())
+        del schur  # 72 MB for 500 keyframes, which the next one needs beside its own
+        if steps is None:
             damping *= 10
             accepted = False
             continue
-        half = solve_triangular(lower, rhs, lower=True, check_finite=False)
-        dc = solve_triangular(lower, half, lower=True, trans=1, check_finite=False)
-        steps = dc.reshape(n_var, 6)
         dp = back_substitute(inverse, gp, hcp, b.camera, b.point, by_point, steps)
         yield_point()
         rotations = np.stack([rotation_from_vector(d[:3]) for d in steps])
@@ -127,3 +121,16 @@ def adjust(
     inlier = ((residual * residual).sum(1) < CHI2_2D) & (p[:, 2] > 0)
     poses = [Pose(rotation[i], translation[i]) for i in range(len(b.poses))]
     return AdjustmentResult(poses, points, inlier)
+
+
+def _solved(schur: Array, rhs: Array) -> Array | None:
+    """Steps (V, 6) of the cameras; None where the matrix is not positive definite."""
+    try:
+        # numpy's, as frames are tracked beside a large adjustment: SciPy's cho_factor holds
+        # the interpreter's lock throughout, 0.16 s for 450 keyframes
+        lower = np.linalg.cholesky(schur)
+    except np.linalg.LinAlgError:
+        return None
+    half = solve_triangular(lower, rhs, lower=True, check_finite=False)
+    out = solve_triangular(lower, half, lower=True, trans=1, check_finite=False)
+    return np.asarray(out.reshape(-1, 6), np.float64)
