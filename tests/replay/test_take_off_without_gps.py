@@ -14,7 +14,7 @@ def test_it_has_a_pose_before_it_is_armed_and_to_the_end() -> None:
     assert flown.first_s < TIMES.armed_s
     assert flown.longest_gap_s < 0.1
     assert TrackState.STANDING in flown.states
-    level_m, down_m = flown.worst_belief_m
+    level_m, down_m = flown.worst_pose_m
     assert level_m < 0.8
     assert down_m < 1.2
     assert {pose.reset_counter for pose in flown.sent} == {0}

@@ -50,7 +50,11 @@ def _over(at: float, radius: float, size: int) -> tuple[int, ...]:
 class PlaneWorld:
     """Planes z = const in NED (down positive), each a rectangle; the highest is seen first."""
 
-    def __init__(self, rng: np.random.Generator, metres_per_texel: float = 0.05) -> None:
+    def __init__(
+        self, rng: np.random.Generator, metres_per_texel: float = 0.05,
+        clear_m: float = -np.inf,
+    ) -> None:  # fmt: skip
+        """Draw a world, without roofs over the middle or nearer to it than `clear_m`."""
         self._metres_per_texel = metres_per_texel
         ground = np.array([-1e6, -1e6, 1e6, 1e6])
         self._planes = [(0.0, ground, texture(rng))]
@@ -58,7 +62,9 @@ class PlaneWorld:
             north, east = rng.uniform(-15, 15, 2)
             size = rng.uniform(4, 8)
             rectangle = np.array([north, east, north + size, east + size])
-            self._planes.append((-1.5 - 0.5 * k, rectangle, texture(rng)))
+            roof = (-1.5 - 0.5 * k, rectangle, texture(rng))
+            if max(*rectangle[:2], *-rectangle[2:]) > clear_m:
+                self._planes.append(roof)
         self._rays: dict[Camera, Array] = {}
 
     def rays_of(self, camera: Camera) -> Array:

@@ -2,11 +2,10 @@
 
     flown = take_off(seed)      # stands, arms, climbs to HEIGHT_M, holds its place in gusts
 
-Physics are those of a point that leans into where it is told to go. It believes the newest pose
-that it was sent, carried on by that pose's velocity, and nothing else. Camera and samples are drawn
-from the true state: blurred near the ground, an IMU with white noise, bias, and the motors'
-vibration aliased to white noise while armed, an attitude with a slow error of its own, a barometer
-that weather and the rotors' pressure upset.
+Camera and samples are drawn from the true state of a made-up copter (`posed_copter`): blurred near
+the ground, an IMU with white noise, bias, and on the line the motors' vibration aliased to white
+noise while armed, an attitude with a slow error of its own, a barometer that weather and the
+rotors' pressure upset.
 """
 
 from __future__ import annotations
@@ -36,25 +35,32 @@ from companion.telemetry import (
     HeightSample,
     ImuSample,
     LandedSample,
+    Telemetry,
+)
+from tests.support.flights.posed_copter import (
+    GRAVITY_NED,
+    STEP_S,
+    Copter,
+    PosedAutopilot,
+    climbed,
 )
 from tests.support.flights.scene import PlaneWorld, texture
 
-STEP_S, FRAME_EVERY, ATTITUDE_EVERY = 0.01, 5, 2
-HEIGHT_M, LEGS_M, CLIMB_M_S = 5.0, 0.2, 1.0
+FRAME_EVERY, ATTITUDE_EVERY = 5, 2
+HEIGHT_M, LEGS_M = 5.0, 0.2
 LATE_NS = 60_000_000
 """From a picture to its pose."""
-GRAVITY_NED = np.array([0.0, 0.0, 9.80665])
 SIGMA_ACCEL_M_S2, SIGMA_BIAS_M_S2, VIBRATION_M_S2 = 0.08, 0.06, 0.5
 SIGMA_GYRO_RAD_S = 0.004
 SIGMA_TILT_RAD, TILT_S, SMOOTH_S = np.radians(0.3), 15.0, 1.0
 """An attitude integrates gyroscopes: what it is off by changes smoothly."""
-GUST_M_S2, GUST_S = 0.25, 2.0
 HEIGHT_EVERY, SIGMA_HEIGHT_M, SIGMA_WEATHER_M, WEATHER_S = 10, 0.1, 0.3, 60.0
 WASH_M, WASH_HEIGHT_M = -0.5, 0.5
 """What the rotors' pressure takes off the barometric height on the ground, and up to where."""
-LEAN_S, DRAG_HZ = 0.15, 0.15
-MAX_ACCEL_M_S2 = 2.5
 DOWN_DEG = 50.0
+START_NS = 10**9
+CLEAR_M = 1.0
+"""About the vehicle, without a roof that it would fly through."""
 
 
 def _camera() -> Camera:
@@ -68,7 +74,7 @@ class Ground:
     """Ground with boxes, with detail from centimetres to tens of metres."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self._world, self._grass = PlaneWorld(rng), texture(rng)
+        self._world, self._grass = PlaneWorld(rng, clear_m=CLEAR_M), texture(rng)
         self._rng = rng
         self._newest: tuple[Pose, Array] | None = None
         """What was seen last, from where: the same while the vehicle stands."""
@@ -115,17 +121,23 @@ class Times(NamedTuple):
 DEFAULT = Times()
 
 
+class Step(NamedTuple):
+    """Time, true place (3,), where to hold, and where the autopilot thinks it is."""
+
+    t_s: float
+    place_m: Array
+    wanted_m: Array
+    believed_m: Array
+
+
 @dataclass
 class Flown:
     """What happened, by the true state."""
 
     times: Times
+    steps: list[Step] = field(default_factory=list)
     sent: list[PoseToSend] = field(default_factory=list)
     sent_s: list[float] = field(default_factory=list)
-    believed_m: list[Array] = field(default_factory=list)
-    """Believed less true place (3,), from the first pose on, each step."""
-    held_m: list[Array] = field(default_factory=list)
-    """True place less the one to hold (3,), each step from `held_s` on."""
     states: list[TrackState] = field(default_factory=list)
     """One a frame."""
     why_not: str = ""
@@ -145,12 +157,29 @@ class Flown:
     @property
     def worst_hold_m(self) -> tuple[float, float]:
         """The furthest away from the place to hold, level and up or down."""
-        return _furthest_m(self.held_m)
+        return _furthest_m([s.place_m - s.wanted_m for s in self.steps if self._holds(s.t_s)])
 
     @property
-    def worst_belief_m(self) -> tuple[float, float]:
-        """The furthest that it was wrong meanwhile about where it is, level and up or down."""
-        return _furthest_m(self.believed_m[-len(self.held_m) :] if self.held_m else [])
+    def worst_pose_m(self) -> tuple[float, float]:
+        """The furthest that a pose sent meanwhile is from the truth, level and up or down."""
+        offsets_m = (
+            p.world_from_body.translation - self.steps[step_of(p.t_ns)].place_m for p in self.sent
+        )
+        return _furthest_m(
+            [off for off, p in zip(offsets_m, self.sent, strict=True) if self._holds(_s(p.t_ns))]
+        )
+
+    def _holds(self, t_s: float) -> bool:
+        return t_s >= self.times.held_s
+
+
+def _s(t_ns: int) -> float:
+    return (t_ns - START_NS) * 1e-9
+
+
+def step_of(t_ns: int) -> int:
+    """Index of the step at a time."""
+    return round(_s(t_ns) / STEP_S)
 
 
 def _furthest_m(offsets_m: list[Array]) -> tuple[float, float]:
@@ -160,95 +189,132 @@ def _furthest_m(offsets_m: list[Array]) -> tuple[float, float]:
     return float(np.linalg.norm(all_m[:, :2], axis=1).max()), float(np.abs(all_m[:, 2]).max())
 
 
-def take_off(seed: int, *settings: str, times: Times = DEFAULT) -> Flown:
-    """Fly once; see above."""
-    rng, weather, camera = np.random.default_rng(seed), np.random.default_rng(seed), _camera()
-    config = load_config(
-        None, ["feedback.mode=odometry", 'telemetry.use=["attitude","imu","height"]', *settings]
-    )
-    stage = LocalisationStage(config, camera, lambda _: nullcontext())
-    gate = PoseGate(config.feedback, use=config.telemetry.use)
-    ground, flown = Ground(rng), Flown(times)
-    assert camera.body_from_camera is not None
-    place, velocity = np.array([0.0, 0.0, -LEGS_M]), np.zeros(3)
-    lean, gust, weather_m = np.zeros(2), np.zeros(3), 0.0
-    tilt, smooth_tilt = np.zeros(3), np.zeros(3)
-    bias = rng.normal(scale=SIGMA_BIAS_M_S2, size=3)
-    heading = rotation_from_vector(np.array([0.0, 0.0, 0.6]))
-    before, newest, waiting = heading, None, list[tuple[int, Odometry]]()
-    for step in range(round(times.end_s / STEP_S)):
-        t_s, t_ns = step * STEP_S, 10**9 + round(step * STEP_S * 1e9)
-        # what it believes, and does about it
-        believed = None
-        if newest is not None:
-            ahead_s = (t_ns - newest.t_ns) * 1e-9
-            believed = newest.world_from_body.translation + ahead_s * newest.velocity_world_m_s
-        command = np.zeros(3)
-        flies = t_s >= times.lift_s
-        if flies and believed is not None and newest is not None:
-            wanted = np.array([0.0, 0.0, -min(HEIGHT_M, CLIMB_M_S * (t_s - times.lift_s))])
-            command = 1.2 * (wanted - believed) - 1.8 * newest.velocity_world_m_s
-            command *= min(1.0, MAX_ACCEL_M_S2 / max(float(np.linalg.norm(command)), 1e-9))
-        # physics
-        lean += (np.arctan2(command[:2], GRAVITY_NED[2]) - lean) * STEP_S / LEAN_S
-        gust += -gust * STEP_S / GUST_S
-        gust += GUST_M_S2 * np.sqrt(2 * STEP_S / GUST_S) * rng.normal(size=3)
-        accel = np.zeros(3)
-        if flies:
-            accel = np.append(GRAVITY_NED[2] * np.tan(lean), command[2])
-            accel = accel + gust - DRAG_HZ * velocity
-            if place[2] + (velocity[2] + accel[2] * STEP_S) * STEP_S > -LEGS_M:
-                accel = -velocity / STEP_S  # it stands
-            velocity = velocity + accel * STEP_S
-            place = place + velocity * STEP_S
-        ned_from_body = rotation_from_vector(np.array([lean[1], -lean[0], 0.0])) @ heading
-        # what is measured
-        tilt += -tilt * STEP_S / TILT_S
-        tilt += SIGMA_TILT_RAD * np.sqrt(2 * STEP_S / TILT_S) * rng.normal(size=3)
-        smooth_tilt += (tilt - smooth_tilt) * STEP_S / SMOOTH_S
-        told = rotation_from_vector(smooth_tilt) @ ned_from_body
-        if step == 0 or step == round(times.armed_s / STEP_S):
-            stage.step(ArmedSample(t_ns, t_s >= times.armed_s))
+class Companion:
+    """What is under test: samples and pictures in, poses out."""
+
+    def __init__(self, camera: Camera, ground: Ground, settings: tuple[str, ...]) -> None:
+        config = load_config(
+            None, ["feedback.mode=odometry", 'telemetry.use=["attitude","imu","height"]', *settings]
+        )
+        self._camera, self._ground = camera, ground
+        self._stage = LocalisationStage(config, camera, lambda _: nullcontext())
+        self._gate = PoseGate(config.feedback, use=config.telemetry.use)
+        self._waiting = list[tuple[int, Odometry]]()
+        self.states: list[TrackState] = []
+
+    @property
+    def why_not(self) -> str:
+        """Reason why nothing is sent."""
+        return self._gate.why_not
+
+    def take(self, sample: Telemetry) -> None:
+        """Take a sample."""
+        self._stage.step(sample)
+        if isinstance(sample, AttitudeSample):
+            self._gate.take_attitude(sample)
+
+    def look(self, seq: int, t_ns: int, ned_from_body: Pose) -> None:
+        """Take a picture from where the vehicle is."""
+        assert self._camera.body_from_camera is not None
+        grey = self._ground.picture(self._camera, ned_from_body @ self._camera.body_from_camera)
+        for out in self._stage.step(Frame(seq, t_ns, grey, np.repeat(grey[..., None], 3, axis=2))):
+            if isinstance(out, Odometry):
+                self._waiting.append((t_ns + LATE_NS, out))
+                self.states.append(out.state)
+
+    def poses(self, t_ns: int) -> list[PoseToSend]:
+        """Poses that leave at a time."""
+        out = []
+        while self._waiting and self._waiting[0][0] <= t_ns:
+            out.append(self._gate.take(self._waiting.pop(0)[1], t_ns))
+        return [pose for pose in (*out, self._gate.due(t_ns)) if pose is not None]
+
+
+class Senses:
+    """Samples of the true state, with their errors."""
+
+    def __init__(self, seed: int, rng: np.random.Generator, armed_s: float) -> None:
+        self._rng, self._weather, self._armed_s = rng, np.random.default_rng(seed), armed_s
+        self._weather_m, self._tilt, self._smooth_tilt = 0.0, np.zeros(3), np.zeros(3)
+        self._bias = rng.normal(scale=SIGMA_BIAS_M_S2, size=3)
+        self._before: Array | None = None
+        self.accel_ned_m_s2 = np.zeros(3)
+        """As the autopilot's own fast samples have it, without what is aliased."""
+
+    def of(self, step: int, t_ns: int, copter: Copter) -> list[Telemetry]:
+        """What is told at a step."""
+        rng, truth = self._rng, copter.ned_from_body
+        armed, out = step * STEP_S >= self._armed_s, list[Telemetry]()
+        self._tilt += -self._tilt * STEP_S / TILT_S
+        self._tilt += SIGMA_TILT_RAD * np.sqrt(2 * STEP_S / TILT_S) * rng.normal(size=3)
+        self._smooth_tilt += (self._tilt - self._smooth_tilt) * STEP_S / SMOOTH_S
+        told = rotation_from_vector(self._smooth_tilt) @ truth
+        if step == 0 or step == round(self._armed_s / STEP_S):
+            out.append(ArmedSample(t_ns, armed))
         if step % 100 == 0:
-            stage.step(LandedSample(t_ns, bool(place[2] > -LEGS_M - 0.1)))
+            out.append(LandedSample(t_ns, bool(copter.place_m[2] > -LEGS_M - 0.1)))
         if step % ATTITUDE_EVERY == 0:
-            attitude = AttitudeSample(t_ns, quaternion_from_rotation(told))
-            stage.step(attitude)
-            gate.take_attitude(attitude)
+            out.append(AttitudeSample(t_ns, quaternion_from_rotation(told)))
         if step % HEIGHT_EVERY == 0:
-            weather_m += -weather_m * HEIGHT_EVERY * STEP_S / WEATHER_S
-            swing_m = SIGMA_WEATHER_M * np.sqrt(2 * HEIGHT_EVERY * STEP_S / WEATHER_S)
-            weather_m += swing_m * weather.normal()
-            wash_m = WASH_M * np.exp((place[2] + LEGS_M) / WASH_HEIGHT_M) * (t_s >= times.armed_s)
-            off_m = weather_m + wash_m + SIGMA_HEIGHT_M * weather.normal()
-            stage.step(HeightSample(t_ns, float(80.0 - place[2] + off_m)))
-        noise = np.hypot(SIGMA_ACCEL_M_S2, VIBRATION_M_S2 * (t_s >= times.armed_s))
-        force = ned_from_body.T @ (accel - GRAVITY_NED) + bias + rng.normal(scale=noise, size=3)
-        turn = before.T @ ned_from_body
+            out.append(HeightSample(t_ns, 80.0 + self._height_m(float(copter.place_m[2]), armed)))
+        force = truth.T @ (copter.accel_m_s2 - GRAVITY_NED) + self._bias
+        force = force + rng.normal(scale=SIGMA_ACCEL_M_S2, size=3)
+        self.accel_ned_m_s2 = told @ force + GRAVITY_NED
+        turn = (truth if self._before is None else self._before).T @ truth
+        self._before = truth
         rates = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / STEP_S
-        before = ned_from_body
-        stage.step(ImuSample(t_ns, rates + rng.normal(scale=SIGMA_GYRO_RAD_S, size=3), force))
-        if step % FRAME_EVERY == 0:
-            seen_from = Pose(ned_from_body, place) @ camera.body_from_camera
-            grey = ground.picture(camera, seen_from)
-            rgb = np.repeat(grey[..., None], 3, axis=2)
-            for out in stage.step(Frame(step // FRAME_EVERY, t_ns, grey, rgb)):
-                if isinstance(out, Odometry):
-                    waiting.append((t_ns + LATE_NS, out))
-                    flown.states.append(out.state)
-        # what is sent
-        poses = []
-        while waiting and waiting[0][0] <= t_ns:
-            poses.append(gate.take(waiting.pop(0)[1], t_ns))
-        poses.append(gate.due(t_ns))
-        for pose in poses:
-            if pose is not None:
-                newest = pose
-                flown.sent.append(pose)
-                flown.sent_s.append(t_s)
-        if believed is not None:
-            flown.believed_m.append(believed - place - [0.0, 0.0, LEGS_M])
-        if t_s >= times.held_s:
-            flown.held_m.append(place - [0.0, 0.0, -HEIGHT_M - LEGS_M])
-    flown.why_not = gate.why_not
+        rates = rates + rng.normal(scale=SIGMA_GYRO_RAD_S, size=3)
+        out.append(ImuSample(t_ns, rates, force + rng.normal(scale=VIBRATION_M_S2 * armed, size=3)))
+        return out
+
+    def _height_m(self, down_m: float, armed: bool) -> float:
+        """Barometric height."""
+        every_s = HEIGHT_EVERY * STEP_S
+        self._weather_m += -self._weather_m * every_s / WEATHER_S
+        swing_m = SIGMA_WEATHER_M * np.sqrt(2 * every_s / WEATHER_S)
+        self._weather_m += swing_m * self._weather.normal()
+        wash_m = WASH_M * np.exp((down_m + LEGS_M) / WASH_HEIGHT_M) * armed
+        return float(self._weather_m + wash_m + SIGMA_HEIGHT_M * self._weather.normal() - down_m)
+
+
+def take_off(
+    seed: int, *settings: str, times: Times = DEFAULT, true_poses: bool = False
+) -> Flown:  # fmt: skip
+    """Fly once; with `true_poses` by the truth, as late as ours: what the vehicle can do."""
+    rng = np.random.default_rng(seed)
+    camera, flown = _camera(), Flown(times)
+    companion = None if true_poses else Companion(camera, Ground(rng), settings)
+    start_m = np.array([0.0, 0.0, -LEGS_M])
+    copter, senses, autopilot = Copter(-LEGS_M), Senses(seed, rng, times.armed_s), PosedAutopilot()
+    late = list[PoseToSend]()
+    for step in range(round(times.end_s / STEP_S)):
+        t_s, t_ns = step * STEP_S, START_NS + round(step * STEP_S * 1e9)
+        wanted = climbed(HEIGHT_M, t_s - times.lift_s)
+        flies = t_s >= times.lift_s and autopilot.known
+        copter.step(autopilot.accel_wanted(wanted) if flies else None, rng)
+        true_pose = Pose(copter.ned_from_body, copter.place_m)
+        samples = senses.of(step, t_ns, copter)
+        autopilot.carry_on(t_ns, senses.accel_ned_m_s2)
+        if companion is None:
+            if step % FRAME_EVERY == 0:
+                place = Pose(copter.ned_from_body, copter.place_m - start_m)
+                late.append(
+                    PoseToSend(t_ns, place, copter.velocity_m_s, 0.02, 0.02, 0.01, 0.1, 100, 0)
+                )
+            sent = [late.pop(0)] if late and t_ns - late[0].t_ns >= LATE_NS else []
+        else:
+            for sample in samples:
+                companion.take(sample)
+            if step % FRAME_EVERY == 0:
+                companion.look(step // FRAME_EVERY, t_ns, true_pose)
+            sent = companion.poses(t_ns)
+        for pose in sent:
+            autopilot.take(pose)
+            flown.sent.append(pose)
+            flown.sent_s.append(t_s)
+        flown.steps.append(
+            Step(t_s, copter.place_m - start_m, wanted.place_m, autopilot.place_m.copy())
+        )
+    if companion is not None:
+        flown.states, flown.why_not = companion.states, companion.why_not
     return flown
