@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from companion.estimation.body.reckoning import CONTRADICTS_SIGMAS
-from companion.estimation.odometry.odometry_course import OdometryCourse
+from companion.estimation.odometry.odometry_course import MAX_SIGMA_SCALE_AIDING, OdometryCourse
 from companion.estimation.odometry.odometry_frame import MapView, OdometryState
 from companion.estimation.odometry.placed_map import PlacedMap, frame_of
 from companion.estimation.odometry.stand import Stand
@@ -16,8 +16,6 @@ YOUNG_NS = 2_000_000_000
 """A map of a take-off grows by ten keyframes a second, and their adjustment lags behind: until then
 it bends. Flown on at once in the firmwares' simulators, poses were off by 0.7 m after four metres
 of climb in one take-off of three, with 0.1 m stated."""
-MAX_SIGMA_SCALE_AIDING = 0.05
-"""Of a map that aids inertial navigation: with a worse scale it would give a wrong velocity."""
 
 
 class MapStarts:

@@ -15,6 +15,8 @@ from companion.geometry.transforms import Array, Pose
 from companion.messages import Georeference, Odometry, Track, TrackState
 
 FLOOR_M, FLOOR_RAD = 0.02, float(np.radians(0.3))
+MAX_SIGMA_SCALE_AIDING = 0.05
+"""Of a map that aids inertial navigation: with a worse scale it would give a wrong velocity."""
 SIGMA_ATTITUDE_RAD = float(np.radians(1.0))
 """Of the autopilot's attitude over some seconds."""
 
@@ -67,6 +69,7 @@ class OdometryCourse:
         self.velocity, self.dead_reckoning = reckoned.velocity_m_s, True
         georeference, slewed_m = self.flown.georeference, self.flown.frame.slewed_m
         sigma_scale = 0.0 if georeference is None else georeference.sigma_scale
+        sigma_scale = min(sigma_scale, MAX_SIGMA_SCALE_AIDING)  # with a worse one it has not aided
         self.flown.hold(track.t_ns, placed, reckoned.sigma_place_m)
         drift = self.drift.add(track.t_ns, placed.translation, sigma_scale, slewed_m)
         return Odometry(

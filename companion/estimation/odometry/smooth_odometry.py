@@ -17,8 +17,13 @@ from companion.estimation.lift_off.ground_aiding import GroundAiding
 from companion.estimation.odometry.flown_map import LastPose
 from companion.estimation.odometry.innovation_gate import MIN_CONSISTENT_NS
 from companion.estimation.odometry.lift_off_heading import LiftOffHeading
-from companion.estimation.odometry.map_starts import MAX_SIGMA_SCALE_AIDING, MapStarts
-from companion.estimation.odometry.odometry_course import FLOOR_M, FLOOR_RAD, OdometryCourse
+from companion.estimation.odometry.map_starts import MapStarts
+from companion.estimation.odometry.odometry_course import (
+    FLOOR_M,
+    FLOOR_RAD,
+    MAX_SIGMA_SCALE_AIDING,
+    OdometryCourse,
+)
 from companion.estimation.odometry.odometry_frame import MapView, OdometryState, drift_m
 from companion.estimation.odometry.stand import Stand
 from companion.estimation.odometry.tracked_velocity import tracked_velocity
@@ -152,6 +157,8 @@ class SmoothOdometry:
             ratio = flown.georeferenced(georeference)
             if flown.last is not None:
                 course.body.rescale(flown.last.place_m, ratio, georeference.sigma_scale)
+        if georeference.sigma_scale > MAX_SIGMA_SCALE_AIDING and self.reckoning.is_good:
+            return course.reckoned(track)
         assert flown.placed is not None
         raw = flown.placed.world_from_body(pose)
         if track.state is TrackState.DEAD_RECKONING:

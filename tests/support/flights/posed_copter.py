@@ -27,6 +27,8 @@ VELOCITY_D, DERIVATIVE_HZ = np.array([0.5, 0.5, 0.0]), 5.0
 SIGMA_PLACE_M, SIGMA_VELOCITY_M_S = 0.2, 0.1
 """Least of a pose: autopilots believe no smaller one."""
 SIGMA_ACCEL_M_S2, BIAS_WALK_M_S3 = 0.35, 0.02
+TILT_WALK_M_S3 = 0.015 * 9.80665
+"""A tilt by which gyroscopes have drifted is learnt, too: it shows as a bias of level axes."""
 KEPT = 100
 """Steps back to which a pose may be of."""
 
@@ -63,8 +65,8 @@ class PosedAutopilot:
         """True once a pose came."""
         self._state = np.zeros((3, 3))
         """Rows: place, velocity, bias of the acceleration."""
-        self._spread = np.diag([1.0, 1.0, 0.1]) ** 2
-        """Covariance (3, 3) of each axis: they are alike."""
+        self._spread = np.tile(np.diag([1.0, 1.0, 0.1]) ** 2, (3, 1, 1))
+        """Covariance of these (3, 3) along each axis."""
         self._past: deque[tuple[int, Array]] = deque(maxlen=KEPT)
         """Times and place and velocity (2, 3) then."""
         self._integral, self._slowing = np.zeros(3), np.zeros(3)
@@ -83,8 +85,8 @@ class PosedAutopilot:
         step = np.array([[1.0, STEP_S, -0.5 * STEP_S**2], [0.0, 1.0, -STEP_S], [0.0, 0.0, 1.0]])
         by = np.array([0.5 * STEP_S**2, STEP_S, 0.0])
         self._state = step @ self._state + by[:, None] * accel_ned_m_s2
-        noise = SIGMA_ACCEL_M_S2**2 * np.outer(by, by)
-        noise[2, 2] = (BIAS_WALK_M_S3 * STEP_S) ** 2
+        noise = np.tile(SIGMA_ACCEL_M_S2**2 * np.outer(by, by), (3, 1, 1))
+        noise[:, 2, 2] = (np.array([TILT_WALK_M_S3, TILT_WALK_M_S3, BIAS_WALK_M_S3]) * STEP_S) ** 2
         self._spread = step @ self._spread @ step.T + noise
         self._past.append((t_ns, self._state[:2].copy()))
 
@@ -98,18 +100,19 @@ class PosedAutopilot:
             self._shift_m += off[0] if self.known else 0.0
             self.known, self._n_resets = True, pose.reset_counter
             self._state[:2] += off
-            gain = np.eye(3, 2)
+            gain = np.tile(np.eye(3, 2), (3, 1, 1))
         else:
             sigmas = (
                 max(pose.sigma_position_m, SIGMA_PLACE_M),
                 max(pose.sigma_velocity_m_s, SIGMA_VELOCITY_M_S),
             )
-            innovation = self._spread[:2, :2] + np.diag(sigmas) ** 2
-            gain = np.linalg.solve(innovation, self._spread[:2]).T
-            self._state += gain @ off
-            self._spread = self._spread - gain @ self._spread[:2]
+            innovation = self._spread[:, :2, :2] + np.diag(sigmas) ** 2
+            gain = np.linalg.solve(innovation, self._spread[:, :2]).transpose(0, 2, 1)
+            self._state += np.einsum("aij,ja->ia", gain, off)
+            self._spread = self._spread - gain @ self._spread[:, :2]
+        moved = np.einsum("aij,ja->ia", gain[:, :2], off)
         for _, kept in self._past:
-            kept += gain[:2] @ off
+            kept += moved
 
     def accel_wanted(self, wanted: SetPoint) -> Array:
         """Acceleration (3,) towards a set point."""

@@ -240,6 +240,17 @@ def test_a_map_without_a_scale_is_not_taken_up_by_a_frame_without_attitude() -> 
     np.testing.assert_allclose(place(found), HERE, atol=0.1)
 
 
+def test_a_scale_that_grows_uncertain_again_interrupts_nothing() -> None:
+    """Of a map that is flown on: poses with a scale off by more than 5 % are not sent."""
+    vehicle = Vehicle()
+    vehicle.frames(20, HERE)
+    found = vehicle.frame(HERE, georeference=replace(PLACED, sigma_scale=0.055))
+    assert found.inertial and found.sigma_scale <= 0.05
+    np.testing.assert_allclose(place(found), HERE, atol=0.05)
+    again = vehicle.frame(HERE, georeference=replace(PLACED, sigma_scale=0.045))
+    assert (again.state, again.reset_counter) == (TrackState.TRACKING, 0)
+
+
 def test_one_wrong_relocalisation_while_blind_is_no_reset_later() -> None:
     vehicle = Vehicle()
     vehicle.frames(20, HERE)
