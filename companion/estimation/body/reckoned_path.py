@@ -15,13 +15,15 @@ MAX_PLACES = 900
 class BodyPlace(NamedTuple):
     """Place (3,) of the body by inertial navigation, world NED, metres; its motion by the same.
 
-    `rotation` (3, 3) is its attitude in the frame of the navigation, by the autopilot.
+    `rotation` (3, 3) is its attitude in the frame of the navigation, by the autopilot, and
+    `sigma_m` the standard deviation of the place per axis.
     """
 
     t_ns: int
     place_world_m: Array
     start: InertialStart
     rotation: Array
+    sigma_m: float
 
 
 class ReckonedPath:

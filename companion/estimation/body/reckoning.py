@@ -46,7 +46,8 @@ class Reckoning:
         if found is not None and attitude is not None:
             world_m = np.asarray(odometry_from_world.inverse().apply(found.place_m))
             start = found.start._replace(t_ns=t_ns)
-            self.path.add(BodyPlace(t_ns, world_m, start, self.rotation(attitude)))
+            rotation, sigma_m = self.rotation(attitude), found.sigma_place_m
+            self.path.add(BodyPlace(t_ns, world_m, start, rotation, sigma_m))
 
     def rotation(self, attitude: BodyAttitude) -> Array:
         """Rotation (3, 3) of a body in the frame of the odometry, by its attitude."""

@@ -45,8 +45,7 @@ class MapStarts:
         frame, goes_on, off_m = frame_of(
             placed, pose, first, course.flown.frame,
             None if first is None else course.reckoning.path.at(first.t_ns),
-            None if reckoned is None else reckoned.place_m,
-            None if last is None else last.place_m, course.gate.max_jump_m,
+            reckoned, None if last is None else last.place_m, course.gate.max_jump_m,
         )  # fmt: skip
         if (
             not goes_on and off_m is not None and not georeference.has_origin

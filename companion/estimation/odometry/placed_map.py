@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.estimation.body.aiding import LEAST_SIGMA_PLACE_M
+from companion.estimation.body.body_filter import Reckoned
 from companion.estimation.body.reckoned_path import BodyPlace
 from companion.estimation.odometry.odometry_frame import MapView, OdometryFrame
 from companion.geometry.transforms import Array, Pose, yaw_angle, yaw_rotation
@@ -58,26 +60,32 @@ class MapStart(NamedTuple):
 
 def frame_of(
     placed: PlacedMap, map_from_camera: Pose, first: MapView | None, before: OdometryFrame,
-    began: BodyPlace | None, reckoned_m: Array | None, last_m: Array | None, max_jump_m: float,
+    began: BodyPlace | None, reckoned: Reckoned | None, last_m: Array | None, max_jump_m: float,
 ) -> MapStart:  # fmt: skip
     """Start of a new map.
 
     A map without an origin goes on from where inertial navigation had the body at its first view
     (`began`), else from the last known place (3,). There is no jump where that, or the place in a
-    map with an origin, is close to where inertial navigation has the body now (`reckoned_m` (3,)).
-    All else is a reset: its poses are unrelated.
+    map with an origin, is close to where inertial navigation has the body now (`reckoned`). All
+    else is a reset: its poses are unrelated. What the map and navigation differ by since its first
+    view is owed as far as the map knows that way better: of a climb with a scale that is 4 % off
+    the barometer may know more.
     """
     has_origin, raw = placed.georeference.has_origin, placed.world_from_body(map_from_camera)
-    turn, offset, owed_m = np.eye(3), np.zeros(3), None
-    if has_origin and reckoned_m is not None:
-        owed_m = raw.translation - reckoned_m
+    turn, offset, owed_m, share = np.eye(3), np.zeros(3), None, np.ones(3)
+    if has_origin and reckoned is not None:
+        owed_m = raw.translation - reckoned.place_m
     elif not has_origin and first is not None and began is not None:
         raw_first = placed.world_from_body(first.map_from_camera)
         # of the first view: autopilots' headings swing on the way up
         turn = yaw_rotation(yaw_angle(began.rotation @ raw_first.rotation.T))
         offset = before.from_world.apply(began.place_world_m) - turn @ raw_first.translation
-        if reckoned_m is not None:
-            owed_m = turn @ raw.translation + offset - reckoned_m
+        if reckoned is not None:
+            owed_m = turn @ raw.translation + offset - reckoned.place_m
+            way_m = turn @ (raw.translation - raw_first.translation)
+            by_scale_m2 = (placed.georeference.sigma_scale * way_m) ** 2
+            grown_m2 = max(reckoned.sigma_place_m**2 - began.sigma_m**2, 0.0)
+            share = grown_m2 / (grown_m2 + by_scale_m2 + LEAST_SIGMA_PLACE_M**2)
     elif not has_origin and last_m is not None:
         offset = last_m - raw.translation
     frame = OdometryFrame.settled(Pose(turn, offset), has_origin, before.slewed_m)
@@ -86,7 +94,8 @@ def frame_of(
     off_m = float(np.linalg.norm(owed_m))
     if off_m >= max_jump_m:
         return MapStart(frame, False, off_m)
-    moved = frame.shifted(-owed_m)
+    known = Pose(turn, offset - (1.0 - share) * owed_m)
+    moved = OdometryFrame.settled(known, has_origin, before.slewed_m).shifted(-share * owed_m)
     if has_origin:  # satellites' error: it is not owed
         moved = OdometryFrame.settled(moved.from_world, True, before.slewed_m)
     return MapStart(moved, True, off_m)

@@ -281,7 +281,7 @@ def take_off(
     seed: int, *settings: str, times: Times = DEFAULT, true_poses: bool = False
 ) -> Flown:  # fmt: skip
     """Fly once; with `true_poses` by the truth, as late as ours: what the vehicle can do."""
-    rng = np.random.default_rng(seed)
+    rng, gusts = np.random.default_rng(seed), np.random.default_rng((seed, 1))
     camera, flown = _camera(), Flown(times)
     companion = None if true_poses else Companion(camera, Ground(rng), settings)
     start_m = np.array([0.0, 0.0, -LEGS_M])
@@ -291,7 +291,7 @@ def take_off(
         t_s, t_ns = step * STEP_S, START_NS + round(step * STEP_S * 1e9)
         wanted = climbed(HEIGHT_M, t_s - times.lift_s)
         flies = t_s >= times.lift_s and autopilot.known
-        copter.step(autopilot.accel_wanted(wanted) if flies else None, rng)
+        copter.step(autopilot.accel_wanted(wanted) if flies else None, gusts)
         true_pose = Pose(copter.ned_from_body, copter.place_m)
         samples = senses.of(step, t_ns, copter)
         autopilot.carry_on(t_ns, senses.accel_ned_m_s2)
