@@ -280,9 +280,9 @@ class LocalisationStage:
         ):
             attitude = None  # told in other axes all at once: images alone keep what is tracked
         stands = self._standing.at(frame.t_ns, frame.grey)
-        if stands and self.state is TrackState.INITIALISING:
-            self._tracker.stand()
         reckoned = self._odometry.begin(frame.t_ns, stands)
+        if (stands or self._smooth.ground.low) and self.state is TrackState.INITIALISING:
+            self._tracker.stand()
         predicted = self._odometry.predicted(frame.t_ns, attitude, reckoned)
         before = self._tracker.map
         aligned = predicted is not None and attitude is not None and self._motion.aligned

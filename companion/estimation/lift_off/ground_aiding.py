@@ -51,6 +51,10 @@ LATE_NS = 150_000_000
 """Heights and ranges aid that long after their own time. In flight they are newer than the frame
 that comes with them, and navigation knows no time before its last measurement: neither a pose of
 that frame nor, half a frame earlier, the velocity that its flow is held against."""
+LOW_M, LOW_NS = 1.0, 3_000_000_000
+"""Height that a lift-off has risen by, or time since, before a map begins: closer than a metre most
+lenses are blurred, and within it all that is seen changes its size several times. Maps that began
+lower were tilted by 7 to 21 degrees a second later, where blur and noise were drawn."""
 MAP_AIDED_NS = 500_000_000
 """A map that has placed the body lately makes flow needless."""
 
@@ -71,6 +75,9 @@ class GroundAiding:
         self._takes_ranges = self._takes_heights = False
         """True in flight where no map aids; for a barometer, high enough, too."""
         self._stood_down_m = 0.0
+        self._lifted_ns: int | None = None
+        self.low = False
+        """True right after a lift-off, too low for a map, while navigation carries the pose."""
         self._upright: tuple[int, float] | None = None
         """Time of the last frame and the cosine of its tilt; None where its attitude is unknown."""
         self._height_ns = self._range_ns = self._flow_ns = 0
@@ -118,7 +125,7 @@ class GroundAiding:
         held_m = place_m if self.stood is None else self.stood.place_m
         turn = self._body.world_from_attitude
         self.stood = AidedPlace(t_ns, held_m, turn, SIGMA_STANDING_M)
-        self._takes_ranges = False
+        self._takes_ranges = self.low = False
         self._late.clear()
         self._held.append(self.stood)
         while self._held[0].t_ns < t_ns - STANDING_LAG_NS:
@@ -132,14 +139,17 @@ class GroundAiding:
         if self.stood is not None:
             self._stood_down_m = float(self.stood.place_m[2])
             self._body.lift_off(self._stood_down_m + LEGS_M, SIGMA_LEGS_M)
-            self.lift_off_flow = LiftOffFlow()
+            self.lift_off_flow, self._lifted_ns = LiftOffFlow(), t_ns
         self.stood = None
         self._held.clear()
         while self._late and self._late[0].t_ns <= t_ns - LATE_NS:
             self._body.aid(self._late.popleft())
         self._takes_ranges = wants
         self._upright = None if upright is None else (t_ns, upright)
-        self._takes_heights = wants and self._stood_down_m - down_m > LEAST_HEIGHT_M
+        risen_m = self._stood_down_m - down_m
+        self._takes_heights = wants and risen_m > LEAST_HEIGHT_M
+        just = self._lifted_ns is not None and t_ns - self._lifted_ns < LOW_NS
+        self.low = just and risen_m < LOW_M and self._body.at(t_ns) is not None
 
     def take_flow(self, measured: GroundVelocity, delay_ns: int) -> bool:
         """Take flow over that ground; autopilot stamps are late by `delay_ns`.

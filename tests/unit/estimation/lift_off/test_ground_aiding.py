@@ -7,7 +7,7 @@ import pytest
 
 from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
-from companion.estimation.lift_off.ground_aiding import LEGS_M, GroundAiding
+from companion.estimation.lift_off.ground_aiding import LEGS_M, LOW_M, GroundAiding
 from companion.estimation.lift_off.optical_flow import GroundVelocity
 from companion.geometry.transforms import Array
 from companion.telemetry import AttitudeSample, ImuSample
@@ -106,6 +106,21 @@ def test_a_picture_in_which_nothing_moves_holds_no_vehicle_that_has_risen() -> N
     vehicle.go_on(2.0, up_and_north, 0.0, np.zeros(3))
     assert STOOD_M[2] - vehicle.place_m[2] > 10.0 * LEGS_M
     assert vehicle.velocity_m_s[0] > 0.5 * (2.0 - 0.7)
+
+
+def test_no_map_begins_until_a_vehicle_has_risen_a_metre_or_hovers_lower() -> None:
+    climbs, hovers, unknown = Vehicle(), Vehicle(), Vehicle()
+    assert not climbs.ground.low
+    for _ in range(29):
+        climbs.go_on(0.1, np.array([0.0, 0.0, -1.0]), 0.0, None)
+        hovers.go_on(0.1, np.zeros(3), 0.0, np.zeros(3))
+        assert climbs.ground.low == (STOOD_M[2] - climbs.place_m[2] < LOW_M)
+        assert hovers.ground.low
+    hovers.go_on(0.2, np.zeros(3), 0.0, np.zeros(3))
+    assert not hovers.ground.low
+    unknown.navigation.reset()
+    unknown.ground.fly(unknown.t_ns + STEP_NS, float(STOOD_M[2]), True, 1.0)
+    assert not unknown.ground.low
 
 
 def test_a_vehicle_that_has_touched_down_sinks_no_further() -> None:
