@@ -295,22 +295,22 @@ def test_a_map_is_flown_on_once_it_has_settled() -> None:
 
 
 def test_a_map_whose_scale_is_worse_than_inertial_navigation_is_not_slewed_to() -> None:
-    """It says that 2.25 m were a tenth more; accelerometers that stood before know better."""
+    """It says that 9 m were 5 % more, with 4.5 % stated; accelerometers that stood know better."""
     vehicle = Vehicle()
     vehicle.frames(20, standing=True)
     vehicle.frames(5)
     first = MapView(vehicle.t_ns, Pose(np.eye(3), HERE))
-    for north_m_s2 in (1.0, -1.0):
+    for north_m_s2 in (4.0, -4.0):
         for _ in range(15):
             before = vehicle.frame(north_m_s2=north_m_s2)
     way_m = float(place(before)[0])
-    assert 2.0 < way_m < 2.5
+    assert 8.5 < way_m < 9.5
     uncertain = replace(PLACED, sigma_scale=0.045)
     for _ in range(40):
-        seen_m = HERE + [1.1 * way_m, 0.0, 0.0]
+        seen_m = HERE + [1.05 * way_m, 0.0, 0.0]
         after = vehicle.frame(seen_m, first=first, georeference=uncertain)
     assert after.state is TrackState.TRACKING and after.reset_counter == 0
-    assert abs(float(place(after)[0]) - way_m) < 0.1
+    assert abs(float(place(after)[0]) - way_m) < 0.25
 
 
 def test_a_map_that_contradicts_inertial_navigation_is_not_flown_on() -> None:
