@@ -157,15 +157,14 @@ class SmoothOdometry:
             ratio = flown.georeferenced(georeference)
             if flown.last is not None:
                 course.body.rescale(flown.last.place_m, ratio, georeference.sigma_scale)
-        if georeference.sigma_scale > MAX_SIGMA_SCALE_AIDING and self.reckoning.is_good:
-            return course.reckoned(track)
         assert flown.placed is not None
         raw = flown.placed.world_from_body(pose)
         if track.state is TrackState.DEAD_RECKONING:
             if reckoned is not None:
                 return course.reckoned(track)
             return course.dead_reckoned(track, pose, raw, georeference)
-        if quality < self._least_quality and self.reckoning.is_good:
+        poor = quality < self._least_quality or georeference.sigma_scale > MAX_SIGMA_SCALE_AIDING
+        if poor and self.reckoning.is_good:
             return course.reckoned(track)
         fair = reckoned is not None and reckoned.sigma_place_m < FAIR_SIGMA_M
         if not self.found_again.certain and fair:
