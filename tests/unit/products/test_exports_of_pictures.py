@@ -87,6 +87,15 @@ def flight(run: FinishedRun, least: int = 0) -> FlightPictures:
     return FlightPictures(run, Path("flight"), frames)
 
 
+def check_colour(path: Path, pixel: Array, place: Array) -> None:
+    """A picture has the ground's colour of a place at a pixel (2,), where it sees that."""
+    shown = Image.open(path)
+    assert shown.size == (320, 240)
+    if (pixel > 2).all() and (pixel < [317, 237]).all():
+        seen = np.array(shown.getpixel((round(float(pixel[0])), round(float(pixel[1])))))
+        assert np.abs(seen - colours(place[:2]).astype(int)).max() < 12  # JPEG
+
+
 def test_mosaic_has_the_colours_of_the_ground(run: FinishedRun, tmp_path: Path) -> None:
     """Each cell against the ground at its place on Earth."""
     (path,) = export_run(run, tmp_path, ExportConfig(formats=("mosaic",)), flight(run))
@@ -163,12 +172,7 @@ def test_colmap_reads_its_model(run: FinishedRun, tmp_path: Path) -> None:
         pixel = image.project_point(place)
         ours = CAMERA.project(pose(k).world_from_camera.inverse().apply(place[None]))[0]
         np.testing.assert_allclose(pixel, ours + 0.5, atol=1e-5)
-        shown = Image.open(folder / "images" / image.name)
-        assert shown.size == (320, 240)
-        if (ours > 2).all() and (ours < [317, 237]).all():
-            at = (round(float(ours[0])), round(float(ours[1])))
-            seen = np.array(shown.getpixel(at))
-            assert np.abs(seen - colours(place[:2]).astype(int)).max() < 12  # JPEG
+        check_colour(folder / "images" / image.name, ours, place)
     assert "without tracks" in (tmp_path / "colmap.accuracy.txt").read_text()
 
 
@@ -183,10 +187,10 @@ def test_nerfstudio_has_cameras_in_the_axes_of_opengl(run: FinishedRun, tmp_path
         x, y, z, _ = np.linalg.inv(frame["transform_matrix"]) @ place
         # OpenGL looks along -z, y up; image v goes down
         pixel = [told["fl_x"] * x / -z + told["cx"], told["fl_y"] * -y / -z + told["cy"]]
-        ours = CAMERA.project(
-            pose(k).world_from_camera.inverse().apply(np.array([[4.0, 1.0, GROUND_M]]))
-        )[0]
+        ned = np.array([4.0, 1.0, GROUND_M])
+        ours = CAMERA.project(pose(k).world_from_camera.inverse().apply(ned[None]))[0]
         np.testing.assert_allclose(pixel, ours + 0.5, atol=1e-6)
+        check_colour(folder / frame["file_path"], ours, ned)
     head, _, body = (folder / told["ply_file_path"]).read_bytes().partition(b"end_header\n")
     assert f"element vertex {len(run.cloud)}".encode() in head
     first = np.frombuffer(body, "<f4", 3)
