@@ -116,7 +116,7 @@ class ObstacleFinder:
         if known.newest is not None:
             things = known.things_world_m - known.world_from_body.translation
             around = sector_of(things, known.world_from_body)
-            is_seen |= np.bincount(around, minlength=N_SECTORS) >= MIN_POINTS
+            is_seen |= np.bincount(around, minlength=N_SECTORS) > 0
             if reach_m <= FREE_M:
                 window_rad = WINDOW_PX / self._camera.fx
                 is_free = free_sectors(known.newest, known.world_from_body, window_rad)
@@ -178,7 +178,8 @@ class ObstacleFinder:
             newest = None
         else:
             things = things_in(newest, 0.5 * WINDOW_PX / self._camera.fx)
-            points = np.concatenate([points, things])
+            # one counts as enough of a sector: others near it have confirmed it
+            points = np.concatenate([points, np.repeat(things, MIN_POINTS, 0)])
         return _Known(track.t_ns, world_from_body, points, sights, newest, things)
 
     def _newest_sight(self, track: Track, update: MapUpdate) -> Seen | None:
