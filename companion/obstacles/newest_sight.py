@@ -84,6 +84,7 @@ class NewestSight:
         if len(poses) < 2:
             return
         depth = sight_depth(self._tracks.seen, poses, self._camera.fx)
+        self._tracks.drop(depth.stray)
         sky = self._sky(grey, now, depth)
         none, certain = np.zeros(len(sky)), np.ones(len(sky))
         self.newest = Seen(

@@ -37,12 +37,15 @@ class SightDepth:
 
     Rays (N, 3), with z 1 in the newest camera, inverse depths (N,), 1/m, standard deviations (N,)
     of these, and what they do not exceed (N,), even if the way was shorter than the poses say.
+    `stray` marks, of all that were followed, what was not seen along one line: it slides along an
+    edge, or moves by itself.
     """
 
     rays: Array
     inverse_m: Array
     sigma: Array
     most_inverse_m: Array
+    stray: NDArray[np.bool_]
 
 
 @dataclass(slots=True, eq=False)
@@ -82,8 +85,9 @@ def sight_depth(seen: Array, world_from_camera: list[Pose], focal_px: float) -> 
     sigma = np.hypot(noise_rad / found.lever, rho * LEFT_RATIO * way / found.lever)
     sure_way = np.maximum(1.0 - WAY_SIGMAS * POSE_M / np.maximum(way, 1e-9), 1e-9)
     most = (np.maximum(rho, 0.0) + SIGMAS * sigma) / sure_way
-    good = (found.n_images >= MIN_IMAGES) & (found.rms * focal_px <= MAX_RMS_PX)
-    return SightDepth(rays[good], rho[good], sigma[good], most[good])
+    stray = found.rms * focal_px > MAX_RMS_PX
+    good = (found.n_images >= MIN_IMAGES) & ~stray
+    return SightDepth(rays[good], rho[good], sigma[good], most[good], stray)
 
 
 def _estimate(rays: Array, before: Array, earlier: _Earlier) -> _Estimate:

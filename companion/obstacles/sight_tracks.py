@@ -86,6 +86,10 @@ class SightTracks:
         now = self._camera.normalise(self._px)
         self.seen = np.concatenate([before, now[None]])[-MOST_IMAGES:]
 
+    def drop(self, which: Mask) -> None:
+        """Follow some corners (N,) no longer, so that others are found in their cells."""
+        self._px, self.seen = self._px[~which], self.seen[:, ~which]
+
     def _band(self, world_from_camera: Array) -> slice:
         """Rows of an image in which the band of heights lies; up to 0 where none."""
         up = _up_rad(self._coarse @ world_from_camera.T).reshape(len(self._coarse_rows), -1)
