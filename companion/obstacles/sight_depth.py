@@ -25,7 +25,7 @@ SIGMAS, WAY_SIGMAS = 2.0, 6.0
 """Of what a depth does not exceed. The longest way of many is often too long: one that hovers has
 gone a decimetre and more by its poses, and what shows no parallax over that would be far away."""
 MAX_RMS_PX = 1.0
-MIN_IMAGES = 4
+MIN_IMAGES = 2
 MOST_FOR_POSES = 350
 LEAST_FOR_POSES = 60
 ROUNDS = 2
