@@ -26,6 +26,9 @@ SIGMAS, WAY_SIGMAS = 2.0, 6.0
 gone a decimetre and more by its poses, and what shows no parallax over that would be far away."""
 MAX_RMS_PX = 1.0
 MIN_IMAGES = 2
+MIN_FOR_POSES = 4
+"""Images before the newest: by which a depth is known; by which poses are made exact, and
+a corner is known to stray."""
 MOST_FOR_POSES = 350
 LEAST_FOR_POSES = 60
 ROUNDS = 2
@@ -37,8 +40,8 @@ class SightDepth:
 
     Rays (N, 3), with z 1 in the newest camera, inverse depths (N,), 1/m, standard deviations (N,)
     of these, and what they do not exceed (N,), even if the way was shorter than the poses say.
-    `stray` marks, of all that were followed, what was not seen along one line: it slides along an
-    edge, or moves by itself.
+    `stray` marks, of all that were followed, what was surely not seen along one line: it slides
+    along an edge, or moves by itself.
     """
 
     rays: Array
@@ -85,8 +88,9 @@ def sight_depth(seen: Array, world_from_camera: list[Pose], focal_px: float) -> 
     sigma = np.hypot(noise_rad / found.lever, rho * LEFT_RATIO * way / found.lever)
     sure_way = np.maximum(1.0 - WAY_SIGMAS * POSE_M / np.maximum(way, 1e-9), 1e-9)
     most = (np.maximum(rho, 0.0) + SIGMAS * sigma) / sure_way
-    stray = found.rms * focal_px > MAX_RMS_PX
-    good = (found.n_images >= MIN_IMAGES) & ~stray
+    is_on_line = found.rms * focal_px <= MAX_RMS_PX
+    good = (found.n_images >= MIN_IMAGES) & is_on_line
+    stray = refined & ~is_on_line & (found.n_images >= MIN_FOR_POSES)
     return SightDepth(rays[good], rho[good], sigma[good], most[good], stray)
 
 
@@ -116,7 +120,7 @@ def _refined(rays: Array, before: Array, earlier: _Earlier, focal_px: float) -> 
 
     Corners that do not fit weigh little (Cauchy). False where there are too few.
     """
-    found = np.flatnonzero((~np.isnan(before[..., 0])).sum(0) >= MIN_IMAGES)
+    found = np.flatnonzero((~np.isnan(before[..., 0])).sum(0) >= MIN_FOR_POSES)
     if len(found) < LEAST_FOR_POSES:
         return False
     few = found[:: -(-len(found) // MOST_FOR_POSES)]
