@@ -59,7 +59,7 @@ class LoopDetector:
         """A confirmed loop closure, or None. `yield_point` is called before each candidate."""
         _, ids = here.observations_of(keyframe)
         near = {k for _, k in here.covisible(ids, 8)} | set(sorted(here.keyframes)[-RECENT:])
-        for key in self._database.query(keyframe.features.descriptors, N_CANDIDATES, near):
+        for key in self._candidates(keyframe, near, here, maps):
             yield_point()
             there = next((m for m in maps if key in m.keyframes), None)
             if there is None:
@@ -68,6 +68,17 @@ class LoopDetector:
             if found is not None and check(found, here is there):
                 return found
         return None
+
+    def _candidates(
+        self, keyframe: Keyframe, near: set[int], here: SlamMap, maps: list[SlamMap]
+    ) -> list[int]:
+        """Similar keyframes, and of other maps as many: those of its own are more alike."""
+        descriptors = keyframe.features.descriptors
+        found = self._database.query(descriptors, N_CANDIDATES, near)
+        if all(each is here for each in maps):
+            return found
+        others = self._database.query(descriptors, N_CANDIDATES, near | here.keyframes.keys())
+        return list(dict.fromkeys([*found, *others]))
 
     def _try(
         self, keyframe: Keyframe, here: SlamMap, other: Keyframe, there: SlamMap

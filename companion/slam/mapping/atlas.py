@@ -197,6 +197,24 @@ class Atlas:
         self._cooldown = LOOP_COOLDOWN
         return self._close(segment, mapper, found)
 
+    def join_maps(self) -> list[LoopClosed]:
+        """Join maps that show the same place, at the end of a flight.
+
+        In flight only the active map is looked for in the others, as they were then.
+        """
+        joined = []
+        for segment in sorted(self.segments, key=lambda each: len(each.keyframes))[:-1]:
+            others = [each for each in self.segments if each is not segment]
+            if len(others) == len(self.segments):
+                continue  # joined by now
+            for keyframe in list(segment.keyframes.values()):
+                found = self._finder.find(keyframe, segment, others, self._plausible)
+                closed = found and self._close(segment, self.mapper_of(segment), found)
+                if closed:
+                    joined.append(closed)
+                    break
+        return joined
+
     def index_keyframe(self, keyframe: Keyframe) -> None:
         """Add a keyframe to place recognition that was not added by `insert_keyframe`."""
         self._database.add(keyframe.keyframe_id, keyframe.features.descriptors)

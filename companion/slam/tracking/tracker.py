@@ -197,8 +197,9 @@ class Tracker:
         self._ahead.close()
         self.map_lock.end_order()
         self._worker.close()
+        joined = self.atlas.join_maps()
         self.atlas.free_index()
-        return self._worker.done()
+        return [*self._worker.done(), *joined]
 
     def _track_frame(self, frame: Frame, features: Features, prior: Prior) -> list[TrackerOutput]:
         if self.state is TrackState.INITIALISING:

@@ -213,3 +213,37 @@ def test_repetitive_facade_is_no_loop(level: bool) -> None:
     slam_map = mapped(ground, line((-24, 0), (24, 0), 30, 0.0), NOWHERE)
     slam_map.level = level
     assert find(29, slam_map, [slam_map]) is None
+
+
+def test_places_of_its_own_map_keep_none_of_another_out() -> None:
+    """A camera that comes to one place again and again, seen from aside in the other map."""
+    ground = Ground(np.random.default_rng(8))
+    here, away = line((0, 0), (1.4, 0), 8, 0.0), line((0, 5), (0, 26), 30, 0.0)
+    path = [*here, *away, *away[::-1], *here[:6]]
+    new = mapped(ground, path, NOWHERE, first_id=20, memory=6)
+    old = mapped(ground, line((1.5, -2), (1.5, 2), 7, 0.4), ELSEWHERE)
+    finder = LoopDetector(index_of(old, new), Relocalizer(CAMERA))
+    newest = new.keyframes[max(new.keyframes)]
+    found = finder.find(newest, new, [old, new], lambda found, same: not same)
+    assert found is not None
+    assert found.there is old
+
+
+def test_maps_that_met_only_while_neither_knew_are_joined_in_the_end() -> None:
+    """The older one was gone on with last, to where the newer one is."""
+    ground = Ground(np.random.default_rng(9))
+    old = mapped(ground, line((-14, 0), (3, 0), 18, 0.0), ELSEWHERE)
+    new = mapped(ground, line((12, 6), (2, 0.5), 12, 0.5), NOWHERE, first_id=40)
+    apart = mapped(ground, line((-20, 20), (-14, 24), 7, 0.0), NOWHERE, first_id=60)
+    atlas = Atlas(FeaturesConfig(), CAMERA, MapLock())
+    atlas.segments = [new, apart, old]
+    for segment in atlas.segments:
+        for keyframe in segment.keyframes.values():
+            atlas.index_keyframe(keyframe)
+    (joined,) = atlas.join_maps()
+    assert not joined.same_map
+    assert [len(segment.keyframes) for segment in atlas.segments] == [30, 7]
+    whole = atlas.segments[0]
+    known = np.array([keyframe.centre for keyframe in whole.keyframes.values()])
+    true = [*line((-14, 0), (3, 0), 18, 0.0), *line((12, 6), (2, 0.5), 12, 0.5)]
+    assert known == pytest.approx(np.array([pose.translation for pose in true]), abs=0.2)
