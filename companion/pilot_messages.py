@@ -74,6 +74,7 @@ SITE_MISPLACED = PilotMessage(WARNING, "saved map contradicted: place not used")
 SITE_OTHER_CAMERA = PilotMessage(NOTICE, "saved map is of another camera")
 SITE_UNREADABLE = PilotMessage(WARNING, "saved map cannot be read: not used")
 SITE_DAMAGED = PilotMessage(NOTICE, "saved map damaged: used in part")
+OTHER_LENS = PilotMessage(WARNING, "focal length looks wrong: calibrate")
 MOUNT_CORRECTED = PilotMessage(NOTICE, "camera mount angle corrected")
 IMU_NOT_USED = PilotMessage(NOTICE, "autopilot IMU data not used")
 IMU_USED = PilotMessage(INFO, "autopilot IMU data used again")
@@ -233,6 +234,7 @@ OF_WARNING: Mapping[str, PilotMessage] = {
     "the map cannot be kept for a restart in flight": MAP_NOT_SAVED,
     "the disk takes no more of the map, which grows in memory": MAP_IN_MEMORY,
     "camera and autopilot were found to disagree, corrected": MOUNT_CORRECTED,
+    "focal length looks wrong: calibrate the lens": OTHER_LENS,
     "the autopilot's IMU is not used: no scale and no dead reckoning by it": IMU_NOT_USED,
     "the autopilot's IMU is used again": IMU_USED,
     "the autopilot's velocity contradicts its positions and is not used": VELOCITY_NOT_USED,

@@ -22,6 +22,7 @@ from companion.estimation.georeference.segment_georeference import SegmentGeoref
 from companion.estimation.gimbal.gimbal_head import GimbalHead
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.judged_acceleration import JudgedAcceleration
+from companion.estimation.lens.lens_watch import LensWatch
 from companion.estimation.lift_off.optical_flow import FlowMeter
 from companion.estimation.lift_off.standing import Standing
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
@@ -120,6 +121,7 @@ class LocalisationStage:
             camera.camera_from_body, camera.body_from_camera is not None and not camera.assumed
         )
         self._shutter = None if camera.readout_ms == 0 else ShutterOfFrames(camera)
+        self._lens = LensWatch(camera)
         self._margin = TrackingMargin(camera, config.features.n_features)
         self._t_ns = 0
         self._telemetry = TelemetryIntake(
@@ -244,6 +246,10 @@ class LocalisationStage:
                     yield out
                 with self._times("shutter"):
                     said = shutter.end(self._tracker.view_of(frame.seq), self._tracker.map)
+                yield from said
+            if self._gimbal is None and self._lens.watches:
+                with self._times("lens"):
+                    said = self._lens.end(self._tracker.view_of(frame.seq), self._tracker.map)
                 yield from said
             yield self._frame_tracked(frame.t_ns, frame.seq, has_picture=True)
         yield from self._flow.of(frame)

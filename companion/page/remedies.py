@@ -49,6 +49,7 @@ OF_WARNING: Mapping[str, str] = {
     "the map cannot be kept for a restart in flight": "Make room on the disk.",
     "the disk takes no more of the map, which grows in memory":
         "Delete flights before the next: over new ground an hour takes some gigabytes.",
+    "focal length looks wrong: calibrate the lens": "Calibrate the lens: Setup, Camera.",
     "camera and autopilot were found to disagree, corrected":
         "Put the angles that are said into the calibration, or into [mount].",
     "the autopilot's IMU is not used: no scale and no dead reckoning by it":

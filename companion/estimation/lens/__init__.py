@@ -1,0 +1,1 @@
+"""The lens: whether its focal length fits how the images turn."""

@@ -1,0 +1,105 @@
+"""Watch on the focal length: it is said where turns show another than is stated."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.estimation.lens.focal_length import Rays, focal_ratio, turn_across_rad
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Array
+from companion.messages import Warned
+from companion.slam.features.view import View
+from companion.slam.map.sparse_map import SlamMap
+
+OTHER_LENS = "focal length looks wrong: calibrate the lens"
+TURN_RAD, LEAST_TURN_RAD = np.radians(4.0), np.radians(2.0)
+"""A pair is taken once the camera has turned by the first, or at last by the second."""
+LONGEST_NS = 1_500_000_000
+"""Between the images of a pair: it still sees most of the same."""
+N_KNOWN, MAX_PAIRS = 20, 300
+NOTICED, SIGMAS, SURE_SIGMA = 0.04, 4.0, 0.012
+"""Difference that is said, with so many standard deviations, which must be small themselves. Over
+level ground, where a turn looks much as a way does, half of what it is off by comes out."""
+ROUNDS, CAUCHY = 10, 2.0
+
+
+class FocalLength(NamedTuple):
+    """True focal length over the stated one, its standard deviation, and how many pairs tell it."""
+
+    ratio: float
+    sigma: float
+    n: int
+
+
+class _Start(NamedTuple):
+    t_ns: int
+    rays: Rays
+    ned_from_camera: Array
+
+
+class LensWatch:
+    """Collects turns of a camera on a body, from one view to another of the same map."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._focal_px = camera.focal_px
+        self._map: SlamMap | None = None
+        self._start: _Start | None = None
+        self._pairs: list[tuple[float, float]] = []
+        self.watches = True
+        """False once the focal length is known: nothing that comes later would be said."""
+
+    def end(self, view: View | None, slam_map: SlamMap) -> list[Warned]:
+        """Compare what was seen in a frame, if it was tracked; what is to be said."""
+        if not self.watches or view is None:
+            return []
+        n_before = len(self._pairs)
+        self.take(view, slam_map)
+        return self._judged(view.t_ns) if len(self._pairs) > n_before else []
+
+    def take(self, view: View, slam_map: SlamMap) -> None:
+        """Add a tracked frame, whose attitude may be known by the autopilot."""
+        if view.ned_from_camera is None:
+            return
+        start = self._start if slam_map is self._map else None
+        self._map = slam_map
+        if start is not None:
+            turn = start.ned_from_camera.T @ view.ned_from_camera
+            turn_rad, late = turn_across_rad(turn), view.t_ns - start.t_ns > LONGEST_NS
+            if turn_rad < TURN_RAD and not late:
+                return
+            if turn_rad >= LEAST_TURN_RAD:
+                found = focal_ratio(start.rays, _rays_of(view), turn, self._focal_px)
+                self._pairs += [] if found is None else [found]
+        self._start = _Start(view.t_ns, _rays_of(view), view.ned_from_camera)
+
+    @property
+    def estimate(self) -> FocalLength | None:
+        """The focal length by all turns so far, with Cauchy's weights; None after too few."""
+        if len(self._pairs) < N_KNOWN:
+            return None
+        ratio, sigma = np.array(self._pairs).T
+        mean, weight = float(np.median(ratio)), sigma**-2.0
+        for _ in range(ROUNDS):
+            shared = weight / (1.0 + ((ratio - mean) / (CAUCHY * sigma)) ** 2)
+            mean = float(shared @ ratio / shared.sum())
+        spread = max(1.0, 1.48 * float(np.median(np.abs(ratio - mean) / sigma)))
+        return FocalLength(mean, spread * float(weight.sum() ** -0.5), len(ratio))
+
+    def _judged(self, t_ns: int) -> list[Warned]:
+        found = self.estimate
+        if found is None or found.sigma > SURE_SIGMA:
+            return []
+        off = abs(found.ratio - 1.0)
+        is_other = off > max(NOTICED, SIGMAS * found.sigma)
+        if is_other or off + SIGMAS * found.sigma < NOTICED or found.n >= MAX_PAIRS:
+            self.watches, self._map, self._start = False, None, None
+        detail = f"it seems to be {found.ratio:.2f} +- {found.sigma:.2f} times what is stated"
+        return [Warned(t_ns, OTHER_LENS, detail)] if is_other else []
+
+
+def _rays_of(view: View) -> Rays:
+    index = np.flatnonzero(view.point_ids >= 0)
+    normalised = view.features.normalised if view.normalised is None else view.normalised
+    return Rays(view.point_ids[index].copy(), normalised[index].copy())

@@ -1,0 +1,93 @@
+"""A focal length that is stated wrongly shows in turns, in the air and by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from companion.estimation.lens.lens_watch import OTHER_LENS, LensWatch
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Array, Pose, rotation_from_vector, yaw_rotation
+from companion.messages import Warned
+from companion.slam.features.orb_features import Ints, features_of
+from companion.slam.features.view import View
+from companion.slam.map.sparse_map import SlamMap
+from tests.support.flights.scene import DOWN_LOOKING
+
+Path = Callable[[float], Pose]
+TRUE = Camera(640, 480, 480.0, 480.0, 320.0, 240.0)
+GREY = np.zeros((480, 640), np.uint8)
+NOISE_PX, SIGMA_ATTITUDE_RAD = 0.5, np.radians(0.2)
+OBLIQUE = DOWN_LOOKING @ rotation_from_vector(np.array([np.radians(35.0), 0.0, 0.0]))
+
+
+def in_the_air(t_s: float) -> Pose:
+    """Weaves over the points and leans, as in gusts."""
+    tilt = np.array([0.1 * np.sin(2.1 * t_s), 0.09 * np.sin(1.7 * t_s + 1), 0.0])
+    place = np.array([5 * np.sin(0.5 * t_s), 4 * np.cos(0.4 * t_s), -10.0])
+    return Pose(yaw_rotation(0.8 * np.sin(0.7 * t_s)) @ rotation_from_vector(tilt), place)
+
+
+def by_hand(t_s: float) -> Pose:
+    """Turned about all axes at a desk, half a metre to and fro."""
+    swing = np.array([0.5 * np.sin(0.9 * t_s), 0.4 * np.sin(1.1 * t_s + 1), 0.0])
+    place = np.array([0.3 * np.sin(0.8 * t_s), 0.2 * np.cos(1.3 * t_s), -1.2])
+    return Pose(yaw_rotation(0.6 * np.sin(0.5 * t_s)) @ rotation_from_vector(swing), place)
+
+
+def said_of(
+    stated: float, path: Path = in_the_air, relief_m: float = 3.0, seconds: float = 60.0
+) -> list[Warned]:
+    """What is said of a camera whose focal length is stated as so many times the true one."""
+    rng = np.random.default_rng(7)
+    camera = replace(TRUE, fx=TRUE.fx * stated, fy=TRUE.fy * stated)
+    watch, slam_map = LensWatch(camera), SlamMap(1.2, 8)
+    wide = 22.0 if path is in_the_air else 3.0
+    points = np.c_[rng.uniform(-wide, wide, (900, 2)), rng.uniform(-relief_m, 0, 900)]
+    said: list[Warned] = []
+    for k in range(int(seconds * 15)):
+        body = path(k / 15)
+        ned_from_camera = body.rotation @ OBLIQUE
+        pixels = TRUE.project(Pose(ned_from_camera, body.translation).inverse().apply(points))
+        pixels = pixels + rng.normal(scale=NOISE_PX, size=pixels.shape)
+        with np.errstate(invalid="ignore"):
+            ids = np.flatnonzero(((pixels > 5) & (pixels < [635, 475])).all(1))
+        measured = rotation_from_vector(rng.normal(scale=SIGMA_ATTITUDE_RAD / 2, size=3))
+        said += watch.end(
+            view_of(camera, pixels[ids], ids, k, measured @ ned_from_camera), slam_map
+        )
+    return said
+
+
+def view_of(camera: Camera, pixels: Array, ids: Ints, k: int, ned_from_camera: Array) -> View:
+    n = len(ids)
+    features = features_of(
+        camera, 1.2, pixels.astype(np.float32), camera.normalise(pixels), np.zeros(n, np.int64),
+        np.zeros(n, np.float32), np.zeros((n, 32), np.uint8),
+    )  # fmt: skip
+    t_ns = k * 1_000_000_000 // 15
+    return View(k, t_ns, features, ned_from_camera, GREY, Pose.identity(), ids)
+
+
+@pytest.mark.parametrize("stated", [0.9, 1.1])
+@pytest.mark.parametrize(
+    ("path", "relief_m"), [(in_the_air, 3.0), (in_the_air, 0.0), (by_hand, 0.6)]
+)
+def test_ten_percent_are_said_once(stated: float, path: Path, relief_m: float) -> None:
+    (warned,) = said_of(stated, path, relief_m)
+    assert warned.what == OTHER_LENS
+    ratio = float(warned.detail.split("be ")[1].split(" ")[0])
+    assert ratio == pytest.approx(1.0 / stated, abs=0.04)
+
+
+@pytest.mark.parametrize("stated", [0.98, 1.0, 1.02])
+@pytest.mark.parametrize("path", [in_the_air, by_hand])
+def test_nothing_is_said_of_two_percent(stated: float, path: Path) -> None:
+    assert not said_of(stated, path)
+
+
+def test_nothing_is_said_without_turns() -> None:
+    assert not said_of(0.9, lambda t_s: Pose(np.eye(3), in_the_air(t_s).translation))
