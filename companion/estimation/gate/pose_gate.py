@@ -27,7 +27,7 @@ from companion.estimation.gate.pose_rules import (
     sigma_place_m,
 )
 from companion.estimation.gate.pose_to_send import PoseToSend
-from companion.estimation.gate.proof import AS_RECKONED, SILENT, Proof, seen_as_reckoned
+from companion.estimation.gate.proof import SILENT, Proof, seen_as_reckoned
 from companion.estimation.gate.reset_counter import ResetCounter
 from companion.geometry.transforms import Pose
 from companion.messages import Odometry
@@ -250,7 +250,9 @@ class PoseGate:
         shift_m = self._down_shift_m
         self._discontinuity()
         self._down_shift_m = shift_m if as_reckoned else None
-        self._stop(RESET, AS_RECKONED if as_reckoned else "")
+        self._stop(RESET)
+        if as_reckoned:
+            self._proof.foretell()
 
     def _time_out(self) -> None:
         """Stop sending: no pose was accepted for too long."""

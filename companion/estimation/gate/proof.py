@@ -14,7 +14,7 @@ from companion.estimation.gate.pose_rules import NO_ATTITUDE
 from companion.messages import Odometry
 
 SILENT = "no frames"
-AS_RECKONED = "seen where dead reckoning has it"
+FORETOLD = "foretold"
 BRIEF_NS = 300_000_000
 """Six frames of 20 a second. A vehicle without a pose is off by a metre within two seconds."""
 MAX_PAUSE_NS = 3_000_000_000
@@ -37,6 +37,10 @@ class Proof:
         """Begin anew; `ceased` says why poses did, where that may shorten it."""
         self._since_ns, self._ceased, self._silent_since_ns = None, ceased, silent_since_ns
 
+    def foretell(self) -> None:
+        """Take that poses go on where they were known to, without a doubt."""
+        self._ceased = FORETOLD
+
     def interrupt(self) -> None:
         """Take that no pose has kept the rules for too long."""
         if self._since_ns is not None and self._ceased != SILENT:
@@ -54,8 +58,8 @@ class Proof:
         if self._since_ns is None:
             self._since_ns = now_ns
         if as_reckoned:
-            self._ceased = AS_RECKONED
-        if self._ceased in (NO_ATTITUDE, AS_RECKONED):
+            self.foretell()
+        if self._ceased in (NO_ATTITUDE, FORETOLD):
             whole_ns = min(whole_ns, BRIEF_NS)
         elif self._ceased == SILENT and self._silent_since_ns is not None:
             whole_ns = min(whole_ns, self._since_ns - self._silent_since_ns)
