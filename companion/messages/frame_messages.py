@@ -110,6 +110,8 @@ class Odometry:
     """Relative standard deviation of the scale, by which all distances are wrong alike."""
     sigma_by_scale_m: float = 0.0
     """Part of `sigma_position_m` that comes of it."""
+    unaided_s: float = 0.0
+    """Time for which dead reckoning has gone by accelerometers alone, the autopilot's own."""
     refused: Mapping[str, int] = field(default_factory=dict)
     """Number of measurements that did not fit the body's motion, so far, by kind."""
 

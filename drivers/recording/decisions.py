@@ -238,5 +238,6 @@ def _odometry(t_ns: int, given: Mapping[str, Any]) -> Odometry:
         number("sigma_position_m"), number("sigma_velocity_m_s"), number("sigma_attitude_rad"),
         number("sigma_yaw_rad"), bool(given.get("inertial", False)),
         float(given.get("sigma_scale", 0.0)), float(given.get("sigma_by_scale_m", 0.0)),
+        float(given.get("unaided_s", 0.0)),
         {str(kind): int(n) for kind, n in (given.get("refused") or {}).items()},
     )  # fmt: skip

@@ -109,6 +109,7 @@ def odometry_bytes(odometry: Odometry) -> bytes:
             "inertial": odometry.inertial,
             "sigma_scale": odometry.sigma_scale,
             "sigma_by_scale_m": odometry.sigma_by_scale_m,
+            "unaided_s": odometry.unaided_s,
             "refused": odometry.refused,
         }
     )

@@ -139,7 +139,7 @@ TOPICS: dict[str, Any] = {
             "velocity_world_m_s": NUMBERS,
             "sigma_position_m": NUMBER, "sigma_velocity_m_s": NUMBER, "sigma_attitude_rad": NUMBER,
             "sigma_yaw_rad": NUMBER, "inertial": FLAG,
-            "sigma_scale": NUMBER, "sigma_by_scale_m": NUMBER,
+            "sigma_scale": NUMBER, "sigma_by_scale_m": NUMBER, "unaided_s": NUMBER,
             "refused": OBJECT,
         },
     ),

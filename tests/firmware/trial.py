@@ -30,6 +30,7 @@ from companion.errors import SourceError
 from tests.firmware.ground import Ground
 from tests.firmware.perfect_pose import PerfectPose
 from tests.firmware.pilots import PILOTS, Pilot
+from tests.firmware.sent_poses import POSES
 from tests.firmware.simulators import ArduCopter, Ports, Px4, Simulator
 from tests.support.autopilot.fake_wire import free_port
 from tests.support.processes.daemon_process import PROGRAM, Daemon
@@ -282,7 +283,7 @@ class Trial:
 
     def last_pose_s(self) -> float:
         """When the autopilot last passed one of our poses on to the ground, else was sent one."""
-        return self.ground.came_s.get("COMPANION/ODOMETRY", 0.0)
+        return max(self.ground.came_s.get(f"COMPANION/{kind}", 0.0) for kind in POSES)
 
     # -- within ----------------------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ import numpy as np
 from companion.estimation.body.aiding import (
     LEAST_SIGMA_PLACE_M,
     SIGMA_BAROMETER_M,
+    Aid,
     AidedHeight,
     AidedPlace,
     AidedRest,
@@ -58,6 +59,7 @@ REFUSED = {1: 10.83, 2: 13.82, 3: 16.27}
 """Chi-square that is exceeded once in a thousand times, by degrees of freedom."""
 NORMALISED_TAU = 30
 """Places, two seconds of them."""
+TELL_LEVEL = Aid.PLACE, Aid.FLOW, Aid.REST
 MAX_REFUSED_NS = 1_000_000_000
 """Places refused for longer are believed: the filter begins anew."""
 SHOCK_NS = 500_000_000
@@ -68,7 +70,8 @@ seldom to measure it, and what they are off by afterwards is no bias."""
 class Reckoned(NamedTuple):
     """Place, velocity (3,) each, local NED, metres, and their standard deviations per axis.
 
-    `start` is what another map's scale can be found from.
+    `start` is what another map's scale can be found from; accelerometers alone have told of the
+    level motion for `unaided_s`.
     """
 
     place_m: Array
@@ -76,6 +79,7 @@ class Reckoned(NamedTuple):
     sigma_place_m: float
     sigma_velocity_m_s: float
     start: InertialStart
+    unaided_s: float = 0.0
 
 
 class BodyFilter:
@@ -93,7 +97,7 @@ class BodyFilter:
         self._taken: deque[tuple[BodyState, Aiding]] = deque()
         """The latest measurements, and the state before each."""
         self._refused_since_ns: int | None = None
-        self._newest_place_ns = 0
+        self._newest_place_ns = self._aided_ns = 0
         self._shaken_since_ns: int | None = None
         self._normalised = 1.0
         """Mean squared innovation per degree of freedom, of the latest places."""
@@ -227,7 +231,7 @@ class BodyFilter:
         start = InertialStart(state.t_ns, velocity_ned_m_s, mean[BIAS].copy(), covariance)
         return Reckoned(
             mean[PLACE].copy(), mean[VELOCITY].copy(), unlikely * state.sigma(PLACE),
-            unlikely * state.sigma(VELOCITY), start,
+            unlikely * state.sigma(VELOCITY), start, (state.t_ns - self._aided_ns) * 1e-9,
         )  # fmt: skip
 
     def _take_waiting(self) -> None:
@@ -277,6 +281,7 @@ class BodyFilter:
         corrected, squared = self._corrected(state, model)
         if corrected is not None:
             self._state = corrected
+            self._aided_ns = measured.t_ns if model.kind in TELL_LEVEL else self._aided_ns
         if again:
             return
         if corrected is None:
@@ -328,7 +333,7 @@ class BodyFilter:
             state = state.with_part(TILT, state.mean[TILT], SIGMA_TILT_M_S2)
         state = _placed(state, place).with_part(VELOCITY, np.zeros(3), SIGMA_SPEED_M_S)
         self._state = state._replace(t_ns=place.t_ns, world_from_attitude=place.world_from_attitude)
-        self._begun, self._refused_since_ns = True, None
+        self._begun, self._refused_since_ns, self._aided_ns = True, None, place.t_ns
         self._taken.clear()
 
 

@@ -34,6 +34,8 @@ from companion.messages import Odometry
 from companion.telemetry import AttitudeSample, is_believed
 
 MIN_SPACING_NS = 4_000_000
+UNAIDED_S = 0.4
+"""Flow, where it aids, does so five times a second."""
 N_PERIODS = 20
 MAX_ATTITUDE_GAP_NS = 2 * MAX_EXTRAPOLATION_NS
 """Between two attitude samples: no time is further from one than extrapolation reaches."""
@@ -88,6 +90,8 @@ class PoseGate:
         self._proof = Proof()
         self._last_stamp_ns = 0
         self._n_predicted = 0
+        self._n_unaided = 0
+        """Poses of accelerometers alone since the last other one."""
         self._periods_ns: deque[int] = deque(maxlen=N_PERIODS)
         self._last_rejection = ""
         self.state = Sending.OFF
@@ -296,4 +300,7 @@ class PoseGate:
         if pose.t_ns < self._last_stamp_ns + MIN_SPACING_NS:
             return None
         self._last_stamp_ns = pose.t_ns
-        return pose
+        accepted = self._accepted
+        is_unaided = accepted is not None and accepted.unaided_s > UNAIDED_S
+        self._n_unaided = self._n_unaided + 1 if is_unaided else 0
+        return pose.repeated(self._n_unaided) if is_unaided else pose

@@ -27,6 +27,18 @@ class PoseToSend:
     quality: int
     reset_counter: int
     predicted: bool = False
+    unaided: bool = False
+    """Of accelerometers alone: it tells an autopilot nothing that it does not know by its own."""
+
+    def repeated(self, n: int) -> PoseToSend:
+        """The pose as the last of `n` by accelerometers alone, whose error is one and the same.
+
+        An autopilot takes the errors of poses for independent, and would weigh this one `n` times.
+        """
+        return replace(
+            self, sigma_position_m=self.sigma_position_m * n**0.5,
+            sigma_velocity_m_s=self.sigma_velocity_m_s * n**0.5, unaided=True,
+        )  # fmt: skip
 
     def ahead(
         self, ahead_ns: int, attitude: Array, attitude_ahead: Array, grown: Growth

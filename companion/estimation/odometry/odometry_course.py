@@ -80,6 +80,7 @@ class OdometryCourse:
             SIGMA_ATTITUDE_RAD,
             self.sigma_yaw_rad(georeference, SIGMA_ATTITUDE_RAD), inertial=True,
             sigma_scale=sigma_scale, sigma_by_scale_m=drift.by_scale_m,
+            unaided_s=reckoned.unaided_s,
         )  # fmt: skip
 
     def dead_reckoned(

@@ -33,7 +33,13 @@ UNKNOWN = [math.nan] * N_COVARIANCE
 
 
 def pose_messages(pose: PoseToSend, mode: str, firmware: Firmware) -> tuple[Any, ...]:
-    """Messages of a pose, as `feedback.mode` and the autopilot want them."""
+    """Messages of a pose, as `feedback.mode` and the autopilot want them.
+
+    ArduPilot takes each velocity to be as good as VISO_VEL_M_NSE says, whatever is stated: of
+    accelerometers alone it gets none.
+    """
+    if pose.unaided and firmware != "px4":
+        return () if mode == "velocity" else vision_messages(pose)[:1]
     if mode == "velocity":
         return (velocity_message(pose, firmware),)
     return (odometry_message(pose, firmware),) if mode == "odometry" else vision_messages(pose)

@@ -14,11 +14,16 @@ from tests.support.autopilot.fake_autopilot import Received
 from tests.support.reference.scoring import read_tum
 
 Array = NDArray[np.float64]
+KINDS = "ODOMETRY", "VISION_POSITION_ESTIMATE"
 
 
 @dataclass(frozen=True)
 class Poses:
-    """ODOMETRY in the order in which it came. Times are seconds."""
+    """Poses in the order in which they came. Times are seconds.
+
+    A VISION_POSITION_ESTIMATE, as ArduPilot gets of accelerometers alone, has no velocity, and
+    counts as of quality 1.
+    """
 
     came_s: Array
     """When, by CLOCK_MONOTONIC."""
@@ -54,18 +59,28 @@ class Poses:
 
 
 def poses_of(received: list[Received]) -> Poses:
-    odometry = [each for each in received if each.kind == "ODOMETRY"]
-    m = [each.message for each in odometry]
-    quaternions = np.array([each.q for each in m]).reshape(-1, 4)
+    posed = [each for each in received if each.kind in KINDS]
+    m = [each.message for each in posed]
+    whole = [each.kind == "ODOMETRY" for each in posed]
+    rotations = [
+        Rotation.from_quat(each.q, scalar_first=True) if has_all
+        else Rotation.from_euler("ZYX", [each.yaw, each.pitch, each.roll])
+        for each, has_all in zip(m, whole, strict=True)
+    ]  # fmt: skip
+    known = list(zip(m, whole, strict=True))
     return Poses(
-        came_s=np.array([each.monotonic_ns * 1e-9 for each in odometry]),
-        stamp_us=np.array([each.time_usec for each in m], np.int64),
+        came_s=np.array([each.monotonic_ns * 1e-9 for each in posed]),
+        stamp_us=np.array([e.time_usec if has_all else e.usec for e, has_all in known], np.int64),
         place=np.array([[each.x, each.y, each.z] for each in m]).reshape(-1, 3),
-        rotations=Rotation.from_quat(np.roll(quaternions, -1, 1)).as_matrix(),
-        velocity_body=np.array([[each.vx, each.vy, each.vz] for each in m]).reshape(-1, 3),
-        quality=np.array([each.quality for each in m], np.int64),
+        rotations=np.array([each.as_matrix() for each in rotations]).reshape(-1, 3, 3),
+        velocity_body=np.array(
+            [[e.vx, e.vy, e.vz] if has_all else [np.nan] * 3 for e, has_all in known]
+        ).reshape(-1, 3),
+        quality=np.array([e.quality if has_all else 1 for e, has_all in known], np.int64),
         resets=np.array([each.reset_counter for each in m], np.int64),
-        sigma_m=np.sqrt([each.pose_covariance[0] for each in m]),
+        sigma_m=np.sqrt(
+            [(e.pose_covariance if has_all else e.covariance)[0] for e, has_all in known]
+        ),
     )
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from companion.geometry.transforms import Pose
 from tests.support.autopilot.fake_autopilot import FakeAutopilot
 from tests.support.autopilot.fake_flight import MadeUpFlight
-from tests.support.autopilot.received_poses import Array, Poses, poses_of
+from tests.support.autopilot.received_poses import KINDS, Array, Poses, poses_of
 from tests.support.cameras.http_camera import HttpCamera, world_from_body
 from tests.support.processes.daemon_process import PROGRAM, Daemon
 from tests.support.processes.strain import Strain
@@ -161,7 +161,7 @@ class Flying:
     @property
     def poses(self) -> Poses:
         """All that the autopilot got."""
-        return poses_of(self.autopilot.of("ODOMETRY"))
+        return poses_of(self.autopilot.of(*KINDS))
 
     def errors(self, poses: Poses) -> tuple[Array, Array]:
         """What each is wrong by, metres and degrees; see `MOST_LATE_S`."""

@@ -492,6 +492,24 @@ def test_inertial_dead_reckoning_bridges_what_is_not_tracked() -> None:
     assert flight.state() is Sending.SENDING
 
 
+def test_poses_of_accelerometers_alone_weigh_as_one() -> None:
+    """Their error is one and the same; told as independent ones, they led PX4's attitude astray."""
+    flight = Flight()
+    flight.run(2)
+    aided = flight.run(1, **BLIND, unaided_s=0.3)
+    assert max(pose.sigma_position_m for pose in aided) < 0.15
+    assert not any(pose.unaided for pose in aided)
+    alone = flight.run(2, **BLIND, unaided_s=0.5)
+    assert sum(1.0 / pose.sigma_position_m**2 for pose in alone) < 7 / 0.1**2  # 80 poses
+    assert alone[-1].sigma_velocity_m_s > 8 * 0.2
+    message = odometry_message(alone[-1], "px4")
+    assert message.pose_covariance[0] == pytest.approx(alone[-1].sigma_position_m**2)
+    (position,) = pose_messages(alone[-1], "odometry", "ardupilot")
+    assert position.get_type() == "VISION_POSITION_ESTIMATE"
+    assert not pose_messages(alone[-1], "velocity", "ardupilot")
+    assert flight.run(0.1)[-1].sigma_position_m < 0.15
+
+
 def test_a_bridge_ends_where_its_uncertainty_does() -> None:
     flight = Flight(max_sigma_m=1.0)
     flight.run(2)
