@@ -17,6 +17,7 @@ from companion.estimation.gate.pose_gate import Sending
 from companion.estimation.gate.pose_journal import JournaledPoseGate
 from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.gate.reset_counter import ResetCounter
+from companion.estimation.resumption.map_resumption import MAP_RESUMED
 from companion.flight_notes import GateStep
 from companion.health import FeedbackHealth
 from companion.messages import Odometry, Warned
@@ -85,7 +86,9 @@ class PoseSender(Sender):
         self._said_why_ns = 0
         link.sends_poses = config.mode != "off"
         self._bridging_since_ns: int | None = None
-        self.takes = {AttitudeSample: self.take_attitude, Odometry: self.take}
+        self.takes = {
+            AttitudeSample: self.take_attitude, Odometry: self.take, Warned: self.take_warning,
+        }  # fmt: skip
 
     def _may_start(self, now_ns: int) -> str:
         """Reason why no first pose of a sequence may be sent now; "" if it may."""
@@ -121,6 +124,11 @@ class PoseSender(Sender):
     def take_attitude(self, sample: AttitudeSample) -> None:
         """Take an attitude of the autopilot."""
         self._gate.take_attitude(sample)
+
+    def take_warning(self, warning: Warned) -> None:
+        """Take what localisation tells of its map."""
+        if warning.what == MAP_RESUMED:
+            self._gate.map_resumed()
 
     def take(self, odometry: Odometry) -> None:
         """Take the odometry of a frame, and send it if the gate allows."""

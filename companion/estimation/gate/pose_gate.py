@@ -120,6 +120,11 @@ class PoseGate:
         self._down_shift_m = None
         self._stop(REBOOTED if self.sending else self.why_not)
 
+    def map_resumed(self) -> None:
+        """Go on in the map of the process before, which localisation has verified."""
+        self._stop(self.why_not)
+        self._proof.foretell()
+
     def reconfigure(self, config: FeedbackConfig) -> None:
         """Change limits; the state is kept."""
         self._config = config

@@ -17,6 +17,7 @@ from companion.telemetry import AttitudeSample, Telemetry
 
 FRAME, DUE = "frame", "due"
 BOOTED, RESTARTED, WITHHELD, LIMITS = "booted", "restarted", "withheld", "limits"
+RESUMED = "resumed"
 
 
 class JournaledPoseGate(PoseGate):
@@ -79,6 +80,11 @@ class JournaledPoseGate(PoseGate):
         super().restart()
         self._say(RESTARTED, self._now_ns())
 
+    def map_resumed(self) -> None:
+        """As `PoseGate.map_resumed`, journaled."""
+        super().map_resumed()
+        self._say(RESUMED, self._now_ns())
+
     def withhold(self, why_not: str) -> None:
         """As `PoseGate.withhold`, journaled."""
         super().withhold(why_not)
@@ -140,6 +146,8 @@ class PoseGateAgain:
             self._gate.autopilot_booted(last if isinstance(last, int) else None)
         elif step.what == RESTARTED:
             self._gate.restart()
+        elif step.what == RESUMED:
+            self._gate.map_resumed()
         elif step.what == WITHHELD:
             self._gate.withhold(str(values["why_not"]))
         elif step.what == LIMITS:

@@ -2,7 +2,8 @@
 
 A pause casts doubt on a pose that goes on by what may have happened in it: two frames lost at 10
 frames/s are no reason to withhold a second of good ones. Of a pose that only could not be checked,
-or that dead reckoning has foretold, there is hardly any.
+or that dead reckoning has foretold, there is hardly any; nor of one in a map that has been verified
+after a restart.
 """
 
 from __future__ import annotations

@@ -181,6 +181,15 @@ def test_discontinuities_are_counted_across_restarts() -> None:
     assert flight.sent[-1][1].reset_counter == 2
 
 
+def test_in_the_map_of_a_process_that_was_killed_poses_go_on_soon() -> None:
+    """Localisation has verified it, over several frames, before it says so."""
+    flight = Flight()
+    flight.run(0.5, state=TrackState.INITIALISING, world_from_body=None)
+    flight.gate.map_resumed()
+    assert not flight.run(0.3)
+    assert flight.run(0.2)
+
+
 def test_discontinuity_before_the_first_pose_is_not_counted() -> None:
     """Its EKF may take a first counter of 1 for a reset."""
     flight = Flight()
@@ -503,7 +512,7 @@ def test_poses_of_accelerometers_alone_weigh_as_one() -> None:
     assert sum(1.0 / pose.sigma_position_m**2 for pose in alone) < 7 / 0.1**2  # 80 poses
     assert alone[-1].sigma_velocity_m_s > 8 * 0.2
     message = odometry_message(alone[-1], "px4")
-    assert message.pose_covariance[0] == pytest.approx(alone[-1].sigma_position_m**2)
+    assert message.pose_covariance[0] == pytest.approx(alone[-1].sigma_position_m ** 2)
     (position,) = pose_messages(alone[-1], "odometry", "ardupilot")
     assert position.get_type() == "VISION_POSITION_ESTIMATE"
     assert not pose_messages(alone[-1], "velocity", "ardupilot")
