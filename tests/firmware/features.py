@@ -17,7 +17,7 @@ from tests.firmware.trial import Conditions, Trial
 
 GPS_S, PLACED_S = 90.0, 30.0
 DEGREE_M = 111319.0
-PULL_M_S, PULLED_S = 1.0, 12.0
+JUMPED_M, PULL_M_S, PULLED_S = 50.0, 1.0, 12.0
 SAID_S, JUMP_M = 3.0, 0.3
 MARKER_AT = 1.5, 1.0
 MARKER_OFF_M = 0.15
@@ -70,7 +70,7 @@ def landing_marker(trial: Trial, figures: Figures) -> None:
 
 
 def spoofed(trial: Trial, figures: Figures) -> None:
-    """Satellites are pulled away at 1 m/s: said, switched, held; rebooted on the ground after."""
+    """Satellites jump by 50 m, then are pulled away: said, switched, held; then a reboot."""
     if not up_by_gps(trial, figures):
         return
     sending = trial.until("poses beside GPS", lambda: trial.sending, 20.0)
@@ -79,17 +79,13 @@ def spoofed(trial: Trial, figures: Figures) -> None:
         trial.pilot.land()
         return
     time.sleep(PLACED_S - 20.0)  # satellites are compared once the map was metric for ten seconds
-    before, began_s = manoeuvres.mean_place(trial), time.time()
-    trial.mark("GPS is pulled away")
-    while (lasts_s := time.time() - began_s) < PULLED_S:
-        trial.pilot.set_parameters({"SIM_GPS1_GLTCH_X": PULL_M_S * lasts_s / DEGREE_M})
-    said_s = _when_told(trial, began_s, "GPS drifts", "GPS position jump")
-    switched_s = _when_told(trial, began_s, "EKF sources switched: no GPS")
-    figures.add("pull of 1 m/s: said after", said_s, "s", SAID_S)
-    figures.add("pull of 1 m/s: source set switched after", switched_s, "s", SAID_S + 1.0)
-    level_m, down_m = strayed_m(trial.ground.window(began_s, time.time()), before)
-    figures.add("pull of 1 m/s: moved, level", level_m.max(), "m", JUMP_M)
-    figures.add("pull of 1 m/s: moved, height", down_m.max(), "m", JUMP_M)
+    _deceive(trial, figures, "jump of 50 m", lambda _lasts_s: JUMPED_M)
+    trial.pilot.set_parameters({"SIM_GPS1_GLTCH_X": 0.0})
+    back_s = time.time()
+    again = trial.until("GPS", lambda: _told(trial, "EKF sources switched: GPS", back_s), 25.0)
+    figures.add("used again after it is where it was", again, "s")
+    time.sleep(manoeuvres.SETTLE_S)
+    switched_s = _deceive(trial, figures, "pull of 1 m/s", lambda lasts_s: PULL_M_S * lasts_s)
     if switched_s is not None:
         manoeuvres.keep_place(trial, figures, "hold on our pose", 10.0)
     trial.pilot.land()
@@ -102,6 +98,24 @@ def spoofed(trial: Trial, figures: Figures) -> None:
     figures.add("its restart is seen after", again, "s")
     texts = [t for t in trial.ground.texts_since(restarted_s) if "EKF sources" in t]
     figures.add_true("the source set is asked for anew", bool(texts), " / ".join(texts))
+
+
+def _deceive(
+    trial: Trial, figures: Figures, name: str, off_m: Callable[[float], float]
+) -> float | None:
+    """Move satellites north, by the time that it lasts; when the source set was switched."""
+    before, began_s = manoeuvres.mean_place(trial), time.time()
+    trial.mark(name)
+    while (lasts_s := time.time() - began_s) < PULLED_S:
+        trial.pilot.set_parameters({"SIM_GPS1_GLTCH_X": off_m(lasts_s) / DEGREE_M})
+    said_s = _when_told(trial, began_s, "GPS drifts", "GPS position jump")
+    switched_s = _when_told(trial, began_s, "EKF sources switched: no GPS")
+    figures.add(f"{name}: said after", said_s, "s", SAID_S)
+    figures.add(f"{name}: source set switched after", switched_s, "s", SAID_S + 1.0)
+    level_m, down_m = strayed_m(trial.ground.window(began_s, time.time()), before)
+    figures.add(f"{name}: moved, level", level_m.max(), "m", JUMP_M)
+    figures.add(f"{name}: moved, height", down_m.max(), "m", JUMP_M)
+    return switched_s
 
 
 def earth_position(trial: Trial, figures: Figures) -> None:
