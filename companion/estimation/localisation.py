@@ -17,6 +17,7 @@ from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.body_odometry import BodyOdometry
 from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.flow_of_frames import FlowOfFrames
+from companion.estimation.gate.proof import MAP_RESUMED
 from companion.estimation.georeference.georeferencer import Georeferencer
 from companion.estimation.georeference.segment_georeference import SegmentGeoreferences
 from companion.estimation.gimbal.gimbal_head import GimbalHead
@@ -28,7 +29,7 @@ from companion.estimation.lift_off.standing import Standing
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.estimation.odometry.tracking_margin import TrackingMargin
 from companion.estimation.resumption.checkpoint import Checkpoint
-from companion.estimation.resumption.map_resumption import MAP_RESUMED, MapResumption
+from companion.estimation.resumption.map_resumption import MapResumption
 from companion.estimation.satellites.satellite_watch import SatelliteWatch
 from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
 from companion.estimation.site.site_in_flight import SiteInFlight

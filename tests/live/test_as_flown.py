@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import CameraConfig, TelemetryConfig
 from companion.estimation.gate.global_gate import IN_USE
-from companion.estimation.resumption.map_resumption import MAP_RESUMED
+from companion.estimation.gate.proof import MAP_RESUMED
 from companion.estimation.site.site_use import LOCATED
 from companion.telemetry import MEASURED, PositionSample
 from drivers.recording.decisions import decisions_of

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from companion.config import Config
+from companion.estimation.gate.proof import MAP_RESUMED
 from companion.estimation.localisation import LocalisationStage
-from companion.estimation.resumption.map_resumption import MAP_RESUMED
 from companion.estimation.site.site_use import DOUBTED, LOCATED, OTHER_CAMERA, SiteUse
 from companion.geometry.transforms import Pose
 from companion.messages import Frame, MapUpdate, Message, Odometry, Track, Warned

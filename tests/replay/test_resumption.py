@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from companion.config import Config
+from companion.estimation.gate.proof import MAP_RESUMED
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.resumption.checkpoint import (
     MAX_BYTES,
@@ -24,7 +25,7 @@ from companion.estimation.resumption.checkpoint import (
     encode,
     read_arrays,
 )
-from companion.estimation.resumption.map_resumption import MAP_NOT_RECOGNISED, MAP_RESUMED
+from companion.estimation.resumption.map_resumption import MAP_NOT_RECOGNISED
 from companion.estimation.resumption.map_verification import TIMEOUT_NS
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import (

@@ -14,7 +14,7 @@ from companion.daemon.control import armed_settings
 from companion.daemon.control.flight_parameters import PARAMETERS
 from companion.daemon.flights import live_flight, recording_recovery, viewing
 from companion.daemon.pose import pose_sender
-from companion.estimation.gate import pose_gate, pose_rules
+from companion.estimation.gate import pose_gate, pose_rules, proof
 from companion.estimation.inertial import imu_verdict
 from companion.estimation.resumption import map_resumption
 from companion.estimation.shutter import shutter_of_frames
@@ -128,7 +128,7 @@ def test_every_warning_has_its_words() -> None:
     whats = {
         *phrases(camera_feed), *phrases(disk_writer), *phrases(live_samples),
         link_watch.DAMAGED, link_watch.REFUSED, link_watch.FLOODS, link_watch.SLOW,
-        map_resumption.MAP_RESUMED, map_resumption.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
+        proof.MAP_RESUMED, map_resumption.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
         localisation_work.IN_MEMORY,
         link_watch.NO_MAVLINK, live_flight.RESTARTED, live_flight.LOCALISATION_DIED,
         live_flight.NOT_FINISHED,
@@ -139,7 +139,7 @@ def test_every_warning_has_its_words() -> None:
         recording_recovery.NOT_WRITABLE, ground_requests.TOO_MANY,
         topics_work.MALFORMED, topics_work.TAKEN,
         topics_work.NOT_TAKEN, flight_result.GIVEN_UP, armed_settings.NOT_KEPT,
-        map_resumption.MAP_RESUMED, map_resumption.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
+        proof.MAP_RESUMED, map_resumption.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
     }  # fmt: skip
     for module in (
         "drivers/mavlink/autopilot_link.py",

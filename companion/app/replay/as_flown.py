@@ -18,10 +18,11 @@ from companion.config import Config
 from companion.errors import FlightError, StageError
 from companion.estimation.gate.gate_journal import OBSTACLES
 from companion.estimation.gate.gates_again import placed_values
+from companion.estimation.gate.proof import MAP_RESUMED
 from companion.estimation.landing.marker_detector import MarkerDetector
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.resumption.checkpoint import CheckpointError, decode, read_arrays
-from companion.estimation.resumption.map_resumption import MAP_NOT_RECOGNISED, MAP_RESUMED
+from companion.estimation.resumption.map_resumption import MAP_NOT_RECOGNISED
 from companion.estimation.satellites.satellite_watch import doubts
 from companion.estimation.site.site_use import SiteUse
 from companion.geometry.camera import Camera

@@ -16,8 +16,8 @@ from companion.daemon.pose.sent_counter import SentCounter
 from companion.estimation.gate.pose_gate import Sending
 from companion.estimation.gate.pose_journal import JournaledPoseGate
 from companion.estimation.gate.pose_to_send import PoseToSend
+from companion.estimation.gate.proof import MAP_RESUMED
 from companion.estimation.gate.reset_counter import ResetCounter
-from companion.estimation.resumption.map_resumption import MAP_RESUMED
 from companion.flight_notes import GateStep
 from companion.health import FeedbackHealth
 from companion.messages import Odometry, Warned

@@ -16,6 +16,8 @@ from companion.messages import Odometry
 
 SILENT = "no frames"
 FORETOLD = "foretold"
+MAP_RESUMED = "map resumed after restart"
+"""Said by localisation once it has verified the map of a process that was killed."""
 BRIEF_NS = 300_000_000
 """Six frames of 20 a second. A vehicle without a pose is off by a metre within two seconds."""
 MAX_PAUSE_NS = 3_000_000_000

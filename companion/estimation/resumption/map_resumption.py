@@ -5,6 +5,7 @@ from __future__ import annotations
 from companion.config import FeaturesConfig
 from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.camera_motion import CameraMotion
+from companion.estimation.gate.proof import MAP_RESUMED
 from companion.estimation.georeference.segment_georeference import SegmentGeoreferences
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.estimation.resumption.checkpoint import MAX_BYTES, Checkpoint
@@ -15,7 +16,6 @@ from companion.slam.map.map_part import map_of, part_around
 from companion.slam.map.site_map import of_this_flight
 from companion.slam.tracking.tracker import Tracker
 
-MAP_RESUMED = "map resumed after restart"
 MAP_NOT_RECOGNISED = "old map not recognised: new map"
 
 
