@@ -61,7 +61,9 @@ class TelemetryIntake:
     def _take(self, sample: Telemetry) -> None:
         if isinstance(sample, PositionSample) and self._gimbal is not None:
             sample = self._gimbal.of_head(sample)
-        if isinstance(sample, PositionSample) and not self._satellites.may_use(sample):
+        if isinstance(sample, PositionSample) and not self._satellites.may_use(
+            sample, self._georeferencer.path.velocity_unproved(sample.t_ns)
+        ):
             return
         self._standing.take(sample)
         self._flow.take(sample)

@@ -31,7 +31,7 @@ from tests.bench.accuracy.injected_faults import FAULTS, NO_FAULT, Span
 class _Believing(SatelliteWatch):
     """Doubts nothing."""
 
-    def may_use(self, sample: PositionSample) -> bool:
+    def may_use(self, sample: PositionSample, velocity_unproved: bool = False) -> bool:
         return True
 
 

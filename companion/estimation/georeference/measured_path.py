@@ -42,6 +42,13 @@ class MeasuredPath:
         for each in (*self.positions.values(), *self._velocity_integral.values()):
             each.prune(before_ns, keyframes_ns)
 
+    def velocity_unproved(self, t_ns: int) -> bool:
+        """True where a velocity that is wrong may have made the map too large, or turned it."""
+        return any(
+            self._velocity_integral[each].newest is not None and self._velocity[each].unproved(t_ns)
+            for each in self.sources
+        )
+
     @property
     def newest_place(self) -> Array | None:
         """Newest position (3,), NED metres, that may place a map; None before there is one."""

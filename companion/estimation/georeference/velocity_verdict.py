@@ -27,6 +27,10 @@ SIGMA_POSITION_M = 0.5
 ALLOWED = 0.03
 """Of the way, beside what the positions explain: a receiver's velocity is late by 0.1 s, say."""
 SIGMAS = 3.0
+PROVED = 0.15
+"""A limit within which a velocity agrees with its positions, and so a map with either."""
+SETTLED_NS = 10_000_000_000
+"""After a change of the verdict the map is placed anew, and its first scale moves."""
 N_AGREEING = 3
 """Comparisons in a row that have to say the same."""
 NOT_USED = "the autopilot's velocity contradicts its positions and is not used"
@@ -41,6 +45,12 @@ class VelocityVerdict:
         self._samples: deque[tuple[int, complex, complex]] = deque(maxlen=WINDOW)
         """Time, position and integral: north and east as real and imaginary part, metres."""
         self._n_other = 0
+        self._settles_ns: int | None = None
+        """Time until which what a map has of the velocity may be wrong; None while not known."""
+
+    def unproved(self, t_ns: int) -> bool:
+        """True where a map may still have the scale and heading of a velocity that is wrong."""
+        return self._settles_ns is None or t_ns < self._settles_ns
 
     def take(self, t_ns: int, position_ned_m: Array, travelled_m: Array) -> Warned | None:
         """Add a position (3,) and the integral (3,) at its time; a change of the verdict."""
@@ -57,11 +67,14 @@ class VelocityVerdict:
             return None
         ratio, sigma = compared
         off, limit = abs(ratio - 1.0), ALLOWED + SIGMAS * sigma
+        if self._settles_ns is None and off < limit < PROVED:
+            self._settles_ns = t_ns
         agrees = off < limit if self.believed else off < ALLOWED
         self._n_other = 0 if agrees == self.believed else self._n_other + 1
         if self._n_other < N_AGREEING:
             return None
         self.believed, self._n_other = not self.believed, 0
+        self._settles_ns = t_ns + SETTLED_NS
         turn_deg = float(np.degrees(np.angle(ratio)))
         words = f"positions go {abs(ratio):.2f} times as far, turned by {turn_deg:+.0f} degrees"
         what = USED_AGAIN if self.believed else NOT_USED

@@ -32,6 +32,9 @@ open; twice that, and vertically twice that again."""
 OF_STATED, OF_STATED_HZ = 0.2, 0.08
 """The same as shares of the accuracy that a receiver states, where that gives more: one that is
 worse wanders more."""
+WRONG_VELOCITY = 0.2
+"""Of a map, as a share of the way, by a velocity of the autopilot that nobody has judged yet: a
+compass or a lens of optical flow that is off turns and stretches it by as much."""
 PATH = 0.01
 """Drift of vision, as a share of the way."""
 LAG_S = 0.12
@@ -92,6 +95,8 @@ class SatelliteResiduals:
         """Accuracy that the last position stated, horizontal and vertical."""
         self.placed_since_s: float | None = None
         """Time at which the map was first placed; None while it is not."""
+        self.velocity_unproved = False
+        """True where the map may be of a wrong velocity."""
         self.path_m = 0.0
         """Length of vision's way since the first pose, metres."""
 
@@ -190,7 +195,7 @@ class SatelliteResiduals:
             placed = self._placed
             of_vision = np.array([
                 PATH * way_m, placed.sigma_scale * level_m, placed.sigma_yaw_rad * level_m,
-                sigma_lag_s * faster,
+                sigma_lag_s * faster, WRONG_VELOCITY * level_m * self.velocity_unproved,
             ])  # fmt: skip
             horizontal = np.linalg.norm([white[0] * shared, rates[0] * span_s, *of_vision])
             vertical = np.linalg.norm([

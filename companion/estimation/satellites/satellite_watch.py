@@ -132,8 +132,12 @@ class SatelliteWatch:
             if t_ns - self._newest_ns > wait_ns:
                 self._begin(t_ns, Doubt.GONE, self._residuals.offset_m(3.0), "")
 
-    def may_use(self, sample: PositionSample) -> bool:
-        """True if a position may place the map."""
+    def may_use(self, sample: PositionSample, velocity_unproved: bool = False) -> bool:
+        """True if a position may place the map.
+
+        `velocity_unproved` where that may be of an autopilot's velocity that is wrong.
+        """
+        self._residuals.velocity_unproved = velocity_unproved
         if sample.source is not PositionSource.GPS:  # the autopilot goes on by other sensors
             return self._doubt in (None, Doubt.GONE)
         if self._doubt is not Doubt.GONE:

@@ -104,7 +104,8 @@ def write_bench(out: FilePath, rows: Sequence[BenchRow]) -> None:
     write_atomically(out / "slam.json", (as_json(rows) + "\n").encode())
     for row in rows:
         if row.paths is not None and row.errors is not None:
-            name = f"{row.flight} {row.fault}".replace(" none", "").replace(" ", "_")
+            name = f"{row.flight} {row.fault}".replace(" none", "").replace("/", " per ")
+            name = name.replace(" ", "_")
             write_atomically(out / f"{name}.svg", picture(row))
 
 

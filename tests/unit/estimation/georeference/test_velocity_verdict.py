@@ -54,6 +54,19 @@ def test_one_that_is_stretched_or_turned_is_not(
     assert turned_deg == pytest.approx(-turn_deg, abs=2.0)
 
 
+@pytest.mark.parametrize("stretch", [1.0, 1.2])
+def test_a_velocity_is_proved_when_it_agrees_or_is_no_longer_used(stretch: float) -> None:
+    verdict, said_s, proved_s = VelocityVerdict(), list[int](), list[int]()
+    for t_s in range(60):
+        place = np.array([4.0 * t_s, 0.0, 0.0])
+        change = verdict.take(t_s * 10**9, place, stretch * place)
+        said_s += [] if change is None else [t_s]
+        proved_s += [] if verdict.unproved(t_s * 10**9) else [t_s]
+    assert len(said_s) == (stretch != 1.0)
+    assert proved_s[0] == (said_s[0] + 10 if said_s else 10)
+    assert proved_s == list(range(proved_s[0], 60))
+
+
 def test_it_is_used_again_when_it_agrees_for_long(rng: np.random.Generator) -> None:
     said = flown(rng, [(1.1, 8.0)] + [(1.0, 0.0)] * 4)
     assert [each.what for each in said] == [NOT_USED, USED_AGAIN] and said[1].good

@@ -62,6 +62,7 @@ class Flown:
         self.t_s = 0.0
         self.map_id = 0
         self.tracked = True
+        self.velocity_unproved = False
         self.used: list[tuple[float, bool]] = []
         self.frozen: Array | None = None
 
@@ -93,7 +94,7 @@ class Flown:
         sample = PositionSample(
             t_ns, PositionSource.GPS, at if self.frozen is None else self.frozen, None, sigma_m
         )
-        self.used.append((self.t_s, self.watch.may_use(sample)))
+        self.used.append((self.t_s, self.watch.may_use(sample, self.velocity_unproved)))
 
     def camera_at(self, place: Array) -> Pose:
         """`map_from_camera` of a body that is there, level."""
@@ -121,6 +122,15 @@ def test_no_word_about_satellites_that_wander(path: Path, seed: int) -> None:
     flown = Flown(path, seed)
     assert flown.fly(60.0) == []
     assert all(used for _, used in flown.used)
+
+
+@pytest.mark.parametrize("unproved", [False, True])
+def test_a_map_that_may_be_of_a_wrong_velocity_says_nothing_of_satellites(unproved: bool) -> None:
+    """It is 15 % too large."""
+    flown = Flown(circle)
+    flown.velocity_unproved = unproved
+    said = [each.what for each in flown.fly(30.0, drift=0.15)]
+    assert said == ([] if unproved else [Doubt.PULL.value])
 
 
 def test_a_receiver_that_states_less_may_wander_more() -> None:
