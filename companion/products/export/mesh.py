@@ -21,6 +21,7 @@ from companion.errors import InputError
 from companion.geometry.transforms import Array
 from companion.messages import Bytes
 from companion.products.cloud import Cloud
+from companion.products.export.smoothing import smoothed
 
 BLOCK = 48
 """Cells of a block, along each side: 1 MB of distances, whatever the size of the map."""
@@ -31,9 +32,9 @@ LEAST_NEIGHBOURS = 3
 TRIM_CELLS = 1.2
 """The surface goes so far beyond its points."""
 N_ROUGH, N_SPREAD = 12, 2
-MOST_ROUGH = 0.4
-"""Cells by which the planes of the nearest points may scatter: beyond it points are of no surface,
-or of a wrong one."""
+MOST_ROUGH = 0.15
+"""Cells by which the planes of the nearest points may scatter, once smoothed: beyond it points are
+of no surface, or of a wrong one."""
 N_SPACING = 2000
 CELLS_PER_SPACING = 2.0
 MAX_CELLS = 400_000_000
@@ -69,6 +70,9 @@ def mesh_of(cloud: Cloud, cell: float = 0.0) -> Mesh:
         sample = points[:: max(1, len(points) // N_SPACING)]
         distance, _ = tree.query(sample, k=2)
         cell = float(f"{CELLS_PER_SPACING * max(np.median(distance[:, 1]), 1e-3):.2g}")
+    cloud = smoothed(cloud)
+    points = cloud.points.astype(np.float64)
+    tree = cKDTree(points)
     low = points.min(0) - 4 * cell
     at = np.floor((points - low) / cell).astype(np.int64)
     if len(np.unique(at // BLOCK, axis=0)) * BLOCK**3 > MAX_CELLS:
