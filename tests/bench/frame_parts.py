@@ -41,7 +41,7 @@ OF_FRAME = {
     "  pose optimisation": SLAM + "tracking.frame_tracker:refine_pose",
     "  patch alignment": SLAM + "tracking.frame_tracker:refine_features",
     "  local map": SLAM + "tracking.frame_tracker:FrameTracker.update_local_map",
-    "keyframe decision": SLAM + "tracking.tracker:Tracker._needs_keyframe",
+    "keyframe decision": SLAM + "tracking.tracked_keyframes:TrackedKeyframes.needed",
     "telemetry": ESTIMATION + "localisation:LocalisationStage._take_samples",
     "attitude, checked": ESTIMATION + "attitude_checks:AttitudeChecks.check",
     "odometry": ESTIMATION + "body_odometry:BodyOdometry.of_track",

@@ -169,7 +169,7 @@ def main() -> None:
     bound_heap()
     stage, file = LocalisationStage(Config(), CAMERA, StageTimes()), ArrayFile(FOLDER)
     stage.put_far_into(file)
-    stage._tracker._next_keyframe_id = options.copies * IDS_APART
+    stage._tracker.keyframes.next_id = options.copies * IDS_APART
     pose_ms: list[float] = []
     keyframe_ms: list[float] = []
     n_tracked = 0

@@ -56,7 +56,7 @@ class MapResumption:
             part = part_around(segment, segment.keyframes[nearest], MAX_BYTES)
         mount, delay_ns = self._attitude.correction
         return Checkpoint(
-            last.t_ns, part, self._tracker.next_keyframe_id,
+            last.t_ns, part, self._tracker.keyframes.next_id,
             None if attitude is None else attitude @ last.map_from_camera.rotation.T, georeference,
             self._odometry.state if georeference is not None else None, mount, delay_ns,
         )  # fmt: skip

@@ -32,8 +32,8 @@ from companion.slam.mapping.mapping_worker import (
     SynchronousMapping,
 )
 from companion.slam.tracking.frame_tracker import FrameTracker
-from companion.slam.tracking.keyframe_choice import equivalent_keyframe, keyframe_of, needs_keyframe
 from companion.slam.tracking.map_start import backfill, continue_map, initialise_map
+from companion.slam.tracking.tracked_keyframes import TrackedKeyframes
 from companion.timing.clock import Timer
 
 MAX_ROTATION_ERROR_RAD = np.radians(15.0)
@@ -86,7 +86,6 @@ class Tracker:
         """which may be of noise."""
         self._drowned = False
         self._is_live = background
-        self._next_keyframe_id = 0
         self.map_lock = MapLock(order)
         """Lock to be held by all other readers of the map."""
         self.atlas = Atlas(config.features, camera, self.map_lock, background)
@@ -95,6 +94,7 @@ class Tracker:
             if background
             else SynchronousMapping()
         )
+        self.keyframes = TrackedKeyframes(self.atlas, self._worker, times)
         self._frame_tracker = FrameTracker(self._config, camera, self.atlas)
         self.state = TrackState.INITIALISING
         self._bootstrap = Bootstrap(camera)
@@ -116,9 +116,7 @@ class Tracker:
         self._last: View | None = None
         self._last_tracked: View | None = None
         """The last frame tracked before loss, where no relative rotation is measured"""
-        self._reference: Keyframe | None = None
-        self._reference_since_ns: int | None = None
-        """Time since which the reference, an older keyframe, has been equivalent"""
+        self.keyframes.reset()
         self._frame_tracker.reset()
 
     def view_of(self, seq: int) -> View | None:
@@ -148,14 +146,14 @@ class Tracker:
         """
         self.atlas.resume(kept)
         self._reset()
-        self._reference = kept.keyframes[max(kept.keyframes)]
-        self._next_keyframe_id = next_keyframe_id
+        self.keyframes.reference = kept.keyframes[max(kept.keyframes)]
+        self.keyframes.next_id = next_keyframe_id
         self.state, self._lost_since_ns = TrackState.LOST, until_ns
 
     def use_site(self, site: SlamMap) -> None:
         """Look for the camera in the map of an earlier flight; before the first frame."""
         self.atlas.use_site(site)
-        self._next_keyframe_id = max(site.keyframes) + 1
+        self.keyframes.next_id = max(site.keyframes) + 1
 
     def drop_map(self, first_keyframe_id: int) -> None:
         """Drop a map; where it is active, initialise another."""
@@ -163,11 +161,6 @@ class Tracker:
             self._reset()
             self._bootstrap = Bootstrap(self._camera)
             self.state, self._lost_since_ns = TrackState.INITIALISING, None
-
-    @property
-    def next_keyframe_id(self) -> int:
-        """The lowest id not used yet."""
-        return self._next_keyframe_id
 
     @property
     def feature_ratio(self) -> float:
@@ -216,10 +209,11 @@ class Tracker:
         self.state = TrackState.TRACKING
         self._lost_since_ns = None
         self._last = view
-        if not self._worker.busy and self._needs_keyframe(view):
-            self._insert(view)
-        assert self._reference is not None
-        return [track_of(self.map, view, self._reference)]
+        keyframes = self.keyframes
+        if not self._worker.busy and keyframes.needed(view):
+            keyframes.insert(view)
+        assert keyframes.reference is not None
+        return [track_of(self.map, view, keyframes.reference)]
 
     # -- initialising ---------------------------------------------------------------------------
 
@@ -239,8 +233,8 @@ class Tracker:
         self.atlas.new_map(level=start.first.ned_from_camera is not None)
         self._reset()
         with self._times("mapping"):
-            first, second = self._keyframe(start.first), self._keyframe(start.second)
-            self._reference, self._last = second, start.second
+            first, second = self.keyframes.new(start.first), self.keyframes.new(start.second)
+            self.keyframes.reference, self._last = second, start.second
             initialise_map(self.atlas, start, first, second)
         self._frame_tracker.update_local_map(start.second)
         self.state, self._lost_since_ns = TrackState.TRACKING, None
@@ -255,11 +249,11 @@ class Tracker:
         """Insert a reconstruction from the last tracked frame into the active map."""
         assert self._last_tracked is not None
         last_tracked, view = self._last_tracked, start.second
-        first = self._keyframe(last_tracked)
+        first = self.keyframes.new(last_tracked)
         continue_map(self.atlas, last_tracked, first, start, continuation)
         self._last, self._last_tracked = view, None
         self._frame_tracker.update_local_map(view)
-        second = self._insert(view)
+        second = self.keyframes.insert(view)
         between = self._backfilled(last_tracked, view, first)
         self.state, self._lost_since_ns = TrackState.TRACKING, None
         return [keyframe_added(self.map, first), *between, track_of(self.map, view, second)]
@@ -314,7 +308,7 @@ class Tracker:
         return _rotation_plausible(view, prior)
 
     def _relocalise_by_reference(self, view: View) -> bool:
-        reference = self._reference
+        reference = self.keyframes.reference
         if self.state is not TrackState.TRACKING or reference is None:
             return False
         return self._frame_tracker.relocalise_by(view, reference)
@@ -328,7 +322,7 @@ class Tracker:
         if segment is not self.map:
             self.atlas.switch_to(segment)
             self._reset()
-            self._reference = relocalised.keyframe
+            self.keyframes.reference = relocalised.keyframe
         return self._frame_tracker.verify(view, relocalised)
 
     def _may_restart(self, t_ns: int, has_attitude: bool) -> bool:
@@ -353,47 +347,6 @@ class Tracker:
             self._bootstrap = Bootstrap(self._camera, start)
         self.state = TrackState.LOST
         return self._initialise(frame, features, prior)
-
-    # -- keyframes ------------------------------------------------------------------------------
-
-    def _needs_keyframe(self, view: View) -> bool:
-        """True if no keyframe makes a view redundant; an equivalent one becomes the reference."""
-        reference = self._reference
-        if reference is not None and reference.keyframe_id not in self.map.retired:
-            since_ns = (
-                reference.t_ns if self._reference_since_ns is None else self._reference_since_ns
-            )
-            if not needs_keyframe(self.map, reference, view, since_ns):
-                return False
-        equivalent = equivalent_keyframe(self.map, view)
-        if equivalent is None:
-            return True
-        self._reference, self._reference_since_ns = equivalent, view.t_ns
-        return False
-
-    def _insert(self, view: View) -> Keyframe:
-        keyframe = self._keyframe(view)
-        features = np.flatnonzero(view.point_ids >= 0)
-        self.map.add_observations(keyframe, features, view.point_ids[features])
-        self._reference, self._reference_since_ns = keyframe, None
-        slam_map = self.map
-
-        def extend() -> Done:
-            with self._times("mapping"):
-                loop_closed = self.atlas.insert_keyframe(slam_map, keyframe)
-            added = keyframe_added(slam_map, keyframe)
-            return [added] if loop_closed is None else [added, loop_closed]
-
-        self._worker.submit(extend)
-        # already adjusted, where it was done at once
-        view.camera_from_map = keyframe.camera_from_map
-        view.point_ids = keyframe.point_ids.copy()
-        return keyframe
-
-    def _keyframe(self, view: View) -> Keyframe:
-        keyframe = keyframe_of(view, self._next_keyframe_id)
-        self._next_keyframe_id += 1
-        return keyframe
 
 
 def _rotation_plausible(view: View, prior: Prior) -> bool:
