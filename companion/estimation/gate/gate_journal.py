@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Protocol
+from typing import Any, Protocol
 
 from companion.flight_notes import GateStep
 from companion.telemetry import Telemetry
@@ -19,6 +19,8 @@ POSE, LANDING, GLOBAL, SOURCES, FLOW = "pose", "landing", "global", "sources", "
 OBSTACLES = "obstacles"
 """Without a journal: OBSTACLE_DISTANCE hangs on the dense map, which is not computed again."""
 BEGIN = "begin"
+Takes = Mapping[type, Callable[[Any], None]]
+"""Methods that take samples, by the kinds of those that count."""
 
 
 class GateJournal:
@@ -47,11 +49,7 @@ class GateJournal:
 class GateAgain(Protocol):
     """A gate that is asked again, by its journal."""
 
-    takes: tuple[type, ...]
-    """Kinds of samples that count."""
-
-    def take_sample(self, sample: Telemetry) -> None:
-        """Take a sample of these kinds."""
+    takes: Takes
 
     def ask(self, step: GateStep) -> object | None:
         """Repeat a call; what it gives to be sent, if anything."""
@@ -63,14 +61,15 @@ def given_again(
     """All that gates give to be sent, by their journals, from the beginning of a flight."""
     samples = list(samples)
     waiting = {
-        name: deque(sample for sample in samples if isinstance(sample, gate.takes))
+        name: deque(sample for sample in samples if type(sample) in gate.takes)
         for name, gate in gates.items()
     }
     n_taken = dict.fromkeys(gates, 0)
     for step in steps:
         gate = gates[step.gate]
         while n_taken[step.gate] < step.n_samples and waiting[step.gate]:
-            gate.take_sample(waiting[step.gate].popleft())
+            sample = waiting[step.gate].popleft()
+            gate.takes[type(sample)](sample)
             n_taken[step.gate] += 1
         given = gate.ask(step)
         if given is not None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from companion.config import FeedbackConfig, GpsConfig, Measurement
 from companion.estimation.gate.flow_gate import FlowGate, FlowToSend
-from companion.estimation.gate.gate_journal import BEGIN
+from companion.estimation.gate.gate_journal import BEGIN, Takes
 from companion.estimation.gate.global_gate import GlobalGate, GlobalToSend
 from companion.estimation.gate.pose_gate import PoseGate
 from companion.estimation.landing.landing_gate import LandingGate, TargetToSend
@@ -18,7 +18,7 @@ from companion.flight_notes import GateStep
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Similarity
 from companion.messages import Georeference, LandingTarget, Odometry, OpticalFlow
-from companion.telemetry import AttitudeSample, PositionSample, Telemetry
+from companion.telemetry import AttitudeSample, PositionSample
 
 FRAME, LIMITS = "frame", "limits"
 PLACED, DOUBT = "placed", "doubt"
@@ -29,17 +29,11 @@ ASKED, ANSWERED, BOOTED = "asked", "answered", "booted"
 class LandingGateAgain:
     """The gate of landing targets; `target_of` gives that of a frame, and raises without one."""
 
-    takes: tuple[type, ...] = (AttitudeSample,)
-
     def __init__(
         self, use: Collection[Measurement], target_of: Callable[[int], LandingTarget]
     ) -> None:
         self._gate, self._target_of = LandingGate(use), target_of
-
-    def take_sample(self, sample: Telemetry) -> None:
-        """Take an attitude of the autopilot."""
-        if isinstance(sample, AttitudeSample):
-            self._gate.take_attitude(sample)
+        self.takes: Takes = {AttitudeSample: self._gate.take_attitude}
 
     def ask(self, step: GateStep) -> TargetToSend | None:
         """Repeat a call; the target that it gives, if any."""
@@ -51,15 +45,9 @@ class LandingGateAgain:
 class FlowGateAgain:
     """The gate of optical flow; `flow_of` gives that of a frame, and raises without one."""
 
-    takes: tuple[type, ...] = (AttitudeSample,)
-
     def __init__(self, config: FeedbackConfig, flow_of: Callable[[int], OpticalFlow]) -> None:
         self._gate, self._flow_of = FlowGate(config), flow_of
-
-    def take_sample(self, sample: Telemetry) -> None:
-        """Take an attitude of the autopilot."""
-        if isinstance(sample, AttitudeSample):
-            self._gate.take_attitude(sample)
+        self.takes: Takes = {AttitudeSample: self._gate.take_attitude}
 
     def ask(self, step: GateStep) -> FlowToSend | None:
         """Repeat a call; the flow that it gives, if any."""
@@ -76,8 +64,6 @@ class FlowGateAgain:
 class GlobalGateAgain:
     """The gates of global positions; `odometry_of` as for `PoseGateAgain`."""
 
-    takes: tuple[type, ...] = (AttitudeSample, PositionSample)
-
     def __init__(
         self, config: FeedbackConfig, use: Collection[Measurement],
         odometry_of: Callable[[int], Odometry],
@@ -85,13 +71,9 @@ class GlobalGateAgain:
         self.config = config
         self._odometry_of = odometry_of
         self._poses, self._gate = PoseGate(config, use=use), GlobalGate(config, use)
-
-    def take_sample(self, sample: Telemetry) -> None:
-        """Take an attitude or a position of the autopilot."""
-        if isinstance(sample, AttitudeSample):
-            self._poses.take_attitude(sample)
-        elif isinstance(sample, PositionSample):
-            self._gate.take_position(sample)
+        self.takes: Takes = {
+            AttitudeSample: self._poses.take_attitude, PositionSample: self._gate.take_position,
+        }  # fmt: skip
 
     def ask(self, step: GateStep) -> GlobalToSend | None:
         """Repeat a call; the position that it gives, if any."""
@@ -125,13 +107,9 @@ class SourceSet:
 class SourceChoiceAgain:
     """The choice of the EKF's source set."""
 
-    takes: tuple[type, ...] = ()
-
     def __init__(self, config: GpsConfig) -> None:
         self._choice = SourceChoice(config)
-
-    def take_sample(self, sample: Telemetry) -> None:
-        """Nothing: no sample counts."""
+        self.takes: Takes = {}
 
     def ask(self, step: GateStep) -> SourceSet | None:
         """Repeat a call; the set that it asks for, if any."""

@@ -7,13 +7,13 @@ from dataclasses import asdict
 from typing import Any
 
 from companion.config import FeedbackConfig, Measurement
-from companion.estimation.gate.gate_journal import POSE, GateJournal
+from companion.estimation.gate.gate_journal import POSE, GateJournal, Takes
 from companion.estimation.gate.pose_gate import PoseGate
 from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.gate.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
 from companion.messages import Odometry
-from companion.telemetry import AttitudeSample, Telemetry
+from companion.telemetry import AttitudeSample
 
 FRAME, DUE = "frame", "due"
 BOOTED, RESTARTED, WITHHELD, LIMITS = "booted", "restarted", "withheld", "limits"
@@ -110,8 +110,6 @@ class JournaledPoseGate(PoseGate):
 class PoseGateAgain:
     """The pose gate of a flight; `odometry_of` gives that of a frame, and raises without one."""
 
-    takes: tuple[type, ...] = (AttitudeSample,)
-
     def __init__(
         self, config: FeedbackConfig, use: Collection[Measurement],
         odometry_of: Callable[[int], Odometry],
@@ -122,11 +120,7 @@ class PoseGateAgain:
         self._values: Mapping[str, Any] = {}
         """Inputs of the call that is repeated."""
         self._gate = PoseGate(config, self._counter, self._down_m, self._may_start, use)
-
-    def take_sample(self, sample: Telemetry) -> None:
-        """Take an attitude of the autopilot."""
-        if isinstance(sample, AttitudeSample):
-            self._gate.take_attitude(sample)
+        self.takes: Takes = {AttitudeSample: self._gate.take_attitude}
 
     def ask(self, step: GateStep) -> PoseToSend | None:
         """Repeat a call; the pose that it gives, if any."""
