@@ -6,7 +6,7 @@ The attitude predicts the next pose of the tracker, its keyframes georeference t
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import astuple, replace
+from dataclasses import astuple
 
 import numpy as np
 
@@ -35,9 +35,10 @@ from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
 from companion.estimation.site.site_in_flight import SiteInFlight
 from companion.estimation.site.site_use import DOUBTED, SiteUse
 from companion.estimation.telemetry_intake import TelemetryIntake
+from companion.estimation.track_intake import TrackIntake
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
-from companion.geometry.transforms import Array, Pose
+from companion.geometry.transforms import Array
 from companion.messages import (
     Bytes,
     Frame,
@@ -121,6 +122,10 @@ class LocalisationStage:
         self._satellites = SatelliteWatch(
             camera.camera_from_body, camera.body_from_camera is not None and not camera.assumed
         )
+        self._tracks = TrackIntake(
+            self._tracker, self._attitude, self._gimbal, self._motion, self._georeferences,
+            self._satellites, self._odometry, self._smooth,
+        )  # fmt: skip
         self._shutter = None if camera.readout_ms == 0 else ShutterOfFrames(camera)
         self._lens = LensWatch(camera)
         self._margin = TrackingMargin(camera, config.features.n_features)
@@ -301,46 +306,9 @@ class LocalisationStage:
             self._attitude.reset()
         # another map must be georeferenced before its first pose is published
         update = self._map_update() if other_map and self._segments() else None
-        seen: Pose | None = None
         for message in tracked:
-            if isinstance(message, Track) and self._smooth.stands_since_ns is not None:
-                yield self._odometry.of_track(message)
-                yield Track(message.seq, message.t_ns, TrackState.LOST)
-            elif isinstance(message, Track) and message.map_from_camera is not None:
-                measured = self._attitude.at(message.t_ns)
-                if message.seq == frame.seq or measured is not None:
-                    # angular rates are held without attitude; those of backfilled frames are rough
-                    self._motion.correct(message.t_ns, message.map_from_camera, measured)
-                corrected_rad = 0.0 if self._gimbal is None else self._gimbal.corrected_rad
-                self._attitude.compare(message, message.map_from_camera.rotation, corrected_rad)
-                view = self._tracker.view_of(message.seq)
-                if view is not None and message.keyframe_id is not None:
-                    self._georeferences.depths.compare(view, self._tracker.map, message.keyframe_id)
-                if message.seq == frame.seq:
-                    seen = message.map_from_camera
-                    self._motion.last = message
-                    self._satellites.take_pose(
-                        message.t_ns, self._tracker.map.first_keyframe_id, message.map_from_camera,
-                        self._georeferences.of(self._tracker.map),
-                    )  # fmt: skip
-                    yield self._odometry.of_track(message)
-                if message.seq != frame.seq or self._smooth.found_again.certain:
-                    mount = self._attitude.correction[0]
-                    ned_from_body = None if measured is None else measured @ mount.T
-                    self._georeferences.take(message, ned_from_body)
-                placed = self._georeferences.main_from_newest.apply_to_pose(message.map_from_camera)
-                yield replace(message, map_from_camera=placed)
-            elif isinstance(message, Track):
-                dead_reckoned = self._motion.dead_reckoned(
-                    message, predicted, self._georeferences.of(self._tracker.map),
-                    self._attitude.at(message.t_ns) is not None,
-                )  # fmt: skip
-                yield self._odometry.of_track(dead_reckoned or message)
-                yield (
-                    message
-                    if dead_reckoned is None
-                    else replace(dead_reckoned, map_from_camera=None)
-                )
+            if isinstance(message, Track):
+                yield from self._tracks.take(message, message.seq == frame.seq, predicted)
             else:
                 yield message
         added = any(isinstance(m, KeyframeAdded) for m in tracked)
@@ -353,7 +321,7 @@ class LocalisationStage:
             yield resumed
             if resumed.what == MAP_RESUMED:
                 yield self._map_update()
-        for warned in self._site.frame(frame.t_ns, seen):
+        for warned in self._site.frame(frame.t_ns, self._tracks.seen):
             yield warned
             if warned.what == DOUBTED:
                 yield self._map_update()
