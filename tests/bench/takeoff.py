@@ -1,6 +1,7 @@
 """Take-off in a closed loop of a drone without GPS that flies by the poses it is sent alone.
 
-    python -m tests.bench.takeoff [SEED ...] [--set SECTION.KEY=VALUE ...] [--true-poses]
+    python -m tests.bench.takeoff [SEED ...] [--gusts M_S2] [--set SECTION.KEY=VALUE ...]
+        [--true-poses]
 
 Some minutes a seed. A line for each: when the first pose came (arming is at 12 s), the longest
 gap without one, how far the place was at most from the one to hold, ten seconds after lift-off and
@@ -12,18 +13,21 @@ from __future__ import annotations
 import argparse
 from itertools import groupby
 
-from tests.support.flights.takeoff_loop import DEFAULT, take_off
+from tests.support.flights.takeoff_loop import DEFAULT, GUSTS_M_S2, take_off
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("seeds", nargs="*", type=int, default=list(range(10)))
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument("--gusts", type=float, default=GUSTS_M_S2, metavar="M_S2")
     parser.add_argument("--true-poses", action="store_true", help="what the vehicle can do itself")
     options = parser.parse_args()
     print(f"armed at {DEFAULT.armed_s} s, lift-off at {DEFAULT.lift_s} s")
     for seed in options.seeds:
-        flown = take_off(seed, *options.set, true_poses=options.true_poses)
+        flown = take_off(
+            seed, *options.set, gusts_m_s2=options.gusts, true_poses=options.true_poses
+        )
         spans = [f"{state.value} {len(list(run))}" for state, run in groupby(flown.states)]
         level_m, down_m = flown.worst_hold_m
         wrong_level_m, wrong_down_m = flown.worst_pose_m

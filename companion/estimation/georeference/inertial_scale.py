@@ -17,8 +17,9 @@ from companion.estimation.inertial.acceleration_integral import AccelerationInte
 from companion.estimation.inertial.inertial_motion import InertialStart
 from companion.geometry.transforms import Array, nearest_rotation
 
-NOISES = tuple(0.5e-4 * 2.0**n for n in range(6))
-"""White noise of a frame's place, units: 0.025 to 0.8 pixels of 500 at the typical distance."""
+NOISES = tuple(0.5e-4 * 2.0**n for n in range(8))
+"""White noise of a frame's place, units: 0.025 to 3.2 pixels of 500 at the typical distance of what
+the first keyframes see; after a climb from the ground all is seen from four times as far."""
 FIRST_SCALE = 30.0
 """Metres per unit that the first weights are for. The unit is the typical distance of what the
 first two keyframes see."""

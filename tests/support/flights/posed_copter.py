@@ -19,7 +19,7 @@ from companion.geometry.transforms import Array, rotation_from_vector
 STEP_S = 0.01
 GRAVITY_NED = np.array([0.0, 0.0, 9.80665])
 LEAN_S, DRAG_HZ, MAX_ACCEL_M_S2 = 0.15, 0.15, 2.5
-GUST_M_S2, GUST_S = 0.25, 2.0
+GUST_S = 2.0
 CLIMB_M_S, CLIMB_M_S2 = 1.0, 1.0
 PLACE_P = np.array([1.0, 1.0, 1.0])
 VELOCITY_P, VELOCITY_I = np.array([2.0, 2.0, 5.0]), np.array([1.0, 1.0, 1.0])
@@ -133,8 +133,8 @@ class PosedAutopilot:
 class Copter:
     """The true state. It stands on the ground until it is told to leave it."""
 
-    def __init__(self, ground_down_m: float) -> None:
-        self._ground_down_m = ground_down_m
+    def __init__(self, ground_down_m: float, gusts_m_s2: float) -> None:
+        self._ground_down_m, self._gusts_m_s2 = ground_down_m, gusts_m_s2
         self.place_m, self.velocity_m_s = np.array([0.0, 0.0, ground_down_m]), np.zeros(3)
         self.accel_m_s2 = np.zeros(3)
         self._lean, self._gust_m_s2 = np.zeros(2), np.zeros(3)
@@ -152,7 +152,7 @@ class Copter:
         lean = np.arctan2(wanted[:2], GRAVITY_NED[2])
         self._lean += (lean - self._lean) * STEP_S / LEAN_S
         self._gust_m_s2 += -self._gust_m_s2 * STEP_S / GUST_S
-        self._gust_m_s2 += GUST_M_S2 * np.sqrt(2 * STEP_S / GUST_S) * rng.normal(size=3)
+        self._gust_m_s2 += self._gusts_m_s2 * np.sqrt(2 * STEP_S / GUST_S) * rng.normal(size=3)
         self.accel_m_s2 = np.zeros(3)
         if accel_wanted_m_s2 is None:
             return

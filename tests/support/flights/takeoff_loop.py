@@ -42,6 +42,8 @@ LATE_NS = 60_000_000
 """From a picture to its pose."""
 DOWN_DEG = 50.0
 START_NS = 10**9
+GUSTS_M_S2 = 0.25
+"""A fresh wind: that of 5 m/s which changes by a third, on what a copter is dragged by."""
 CLEAR_M = 1.0
 """About the vehicle, without a roof that it would fly through."""
 
@@ -214,14 +216,19 @@ class Companion:
 
 
 def take_off(
-    seed: int, *settings: str, times: Times = DEFAULT, true_poses: bool = False
+    seed: int, *settings: str, times: Times = DEFAULT, gusts_m_s2: float = GUSTS_M_S2,
+    true_poses: bool = False,
 ) -> Flown:  # fmt: skip
     """Fly once; with `true_poses` by the truth, as late as ours: what the vehicle can do."""
     rng, gusts = np.random.default_rng(seed), np.random.default_rng((seed, 1))
     camera, flown = _camera(), Flown(times)
     companion = None if true_poses else Companion(camera, Ground(rng), settings)
     start_m = np.array([0.0, 0.0, -LEGS_M])
-    copter, senses, autopilot = Copter(-LEGS_M), Senses(seed, rng, times.armed_s), PosedAutopilot()
+    copter, senses, autopilot = (
+        Copter(-LEGS_M, gusts_m_s2),
+        Senses(seed, rng, times.armed_s),
+        PosedAutopilot(),
+    )
     late = list[PoseToSend]()
     for step in range(round(times.end_s / STEP_S)):
         t_s, t_ns = step * STEP_S, START_NS + round(step * STEP_S * 1e9)

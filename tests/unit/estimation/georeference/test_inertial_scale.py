@@ -40,7 +40,7 @@ class Flight:
 
     def __init__(
         self, path: Path, seed: int = 0, axes: Array | None = None, seconds: float = SECONDS,
-        rng: Any = None,
+        rng: Any = None, noise: float = 4e-4,
     ) -> None:  # fmt: skip
         rng = rng or np.random.default_rng(seed)
         self.integral = AccelerationIntegral()
@@ -51,14 +51,12 @@ class Flight:
         t_s = np.arange(0.5, seconds, 0.05)
         turns = np.array([turned(each) for each in t_s])
         where = np.array([path(each) for each in t_s]) + turns @ LEVER_M
-        noise = rng.normal(scale=4e-4, size=where.shape)
+        off = rng.normal(scale=noise, size=where.shape)
         way = np.linalg.norm(np.diff(where, axis=0, prepend=where[:1]), axis=1) / METRES_PER_UNIT
-        noise = noise + np.cumsum(
-            rng.normal(size=where.shape) * 1e-3 * np.sqrt(way)[:, None], axis=0
-        )
+        off = off + np.cumsum(rng.normal(size=where.shape) * 1e-3 * np.sqrt(way)[:, None], axis=0)
         self.places = Places(
             np.round(t_s * 1e9).astype(np.int64), MAP_FROM_NED @ turns,
-            where @ MAP_FROM_NED.T / METRES_PER_UNIT + noise, motion.tilt @ turns,
+            where @ MAP_FROM_NED.T / METRES_PER_UNIT + off, motion.tilt @ turns,
         )  # fmt: skip
 
     def scale(self) -> Scale | None:
@@ -80,6 +78,16 @@ def test_scale_of_a_weaving_flight(seed: int) -> None:
     error = np.log(found.scale / METRES_PER_UNIT)
     print(f"{100 * error:.2f} % off, {100 * found.sigma:.2f} % stated")
     assert found.sigma < 0.03
+    assert abs(error) < 3.0 * found.sigma
+
+
+def test_a_map_that_is_seen_from_far_above_where_it_began_is_weighted_as_noisy() -> None:
+    """Its unit is what it began with, a metre above the ground: a pixel is many of its errors."""
+    found = Flight(swaying, noise=6e-3).scale()
+    assert found is not None
+    error = np.log(found.scale / METRES_PER_UNIT)
+    print(f"{100 * error:.2f} % off, {100 * found.sigma:.2f} % stated")
+    assert found.sigma < 0.04
     assert abs(error) < 3.0 * found.sigma
 
 
