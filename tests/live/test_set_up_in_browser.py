@@ -26,6 +26,7 @@ from drivers.camera.pattern_camera import BODY_FROM_CAMERA
 from drivers.images.calibration_file import read_calibration
 from tests.support.browser import CHROMIUM, Browser
 from tests.support.cameras.board_pictures import CHARUCO, RADTAN, BoardPictures, placings
+from tests.support.processes.flying import source
 from tests.support.processes.paged import Paged
 from tests.support.waiting import until
 
@@ -157,12 +158,23 @@ def test_arming_ends_what_is_heavy(page: Any, paged: Paged) -> None:
     paged.camera.shown = None
 
 
+def fly_shortly(paged: Paged) -> None:
+    """A flight of a hundred pictures that are tracked: a replay waits for all else that runs."""
+    paged.start_again()
+    paged.autopilot.arm()
+    paged.daemon.until(lambda health: health["tracker"] == "tracking", "tracking")
+    beyond = paged.until_source("camera", "running")["n"] + 100
+    paged.daemon.until(lambda health: source(health, "camera")["n"] > beyond, "flown")
+    paged.autopilot.disarm()
+    paged.daemon.until(lambda health: health["armed"] is False, "disarmed")
+    paged.start_again()
+
+
 def test_a_flight_is_replayed_again(page: Any, paged: Paged) -> None:
     page.goto("about:blank")  # it would complain of a daemon that is away
-    paged.start_again()  # which ends the flight
-    paged.daemon.until(lambda health: health["armed"] is False, "disarmed")
+    fly_shortly(paged)
     go(page, paged, "/flights")
-    page.locator(".flights a").last.click()
+    page.locator(".flights a").last.click()  # the one before, which is long enough to be stopped
     page.get_by_role("heading", name="Replay again").wait_for(timeout=PATIENCE_MS)
     name = page.url.rsplit("/", 1)[1]
     press(page, "Replay it")
@@ -173,6 +185,11 @@ def test_a_flight_is_replayed_again(page: Any, paged: Paged) -> None:
         timeout=PATIENCE_MS
     )
     assert not list((paged.daemon.flights / name).glob("replay-*"))
+    go(page, paged, "/flights")
+    page.locator(".flights a").filter(has_not_text="being recorded").first.click()
+    page.get_by_role("heading", name="Replay again").wait_for(timeout=PATIENCE_MS)
+    assert page.url.rsplit("/", 1)[1] > name
+    name = page.url.rsplit("/", 1)[1]
     page.get_by_label("Other settings").fill("expert.features.n_features=400")
     page.get_by_label("Dense map").select_option("false")
     press(page, "Replay it")
