@@ -170,9 +170,11 @@ class Camera:
             radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
             slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
             cross = slope * x * y + 2 * (p1 * x + p2 * y)
-            dx_dx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-            dy_dy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-            return np.stack([np.stack([dx_dx, cross], -1), np.stack([cross, dy_dy], -1)], -2)
+            out = np.empty((*n.shape[:-1], 2, 2))
+            out[..., 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+            out[..., 0, 1] = out[..., 1, 0] = cross
+            out[..., 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+            return out
         step = 1e-6
         dx = (self.distort(n + [step, 0]) - self.distort(n - [step, 0])) / (2 * step)
         dy = (self.distort(n + [0, step]) - self.distort(n - [0, step])) / (2 * step)

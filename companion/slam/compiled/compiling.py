@@ -32,7 +32,7 @@ def given(element: Any, dimensions: int) -> Any:
 
 
 numbers, pairs, matrices = given(number, 1), given(number, 2), given(number, 3)
-integers, flags = given(integer, 1), given(flag, 1)
+integers, tables, flags = given(integer, 1), given(integer, 2), given(flag, 1)
 half_word, small_integer, tiny_word = types.uint32, types.int32, types.uint8
 single_pairs, words = given(types.float32, 2), given(types.uint64, 2)
 images, patches = given(types.uint8, 2), given(types.uint8, 3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +12,8 @@ from companion.geometry.camera import CONVERGED, Camera, Distortion
 from companion.geometry.transforms import Array
 from companion.messages import Bytes, Floats
 from companion.slam.compiled.compiling import Bools, Ints
+from companion.slam.compiled.corners import corners
+from companion.slam.compiled.describing import described
 from companion.slam.compiled.spreading import spread
 from companion.slam.compiled.undistorting import undistort
 
@@ -67,24 +68,15 @@ def normalise(camera: Camera, pixels: Floats) -> Array:
     return undistort(distorted, np.array(camera.coefficients), CONVERGED)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Level:
-    """A level of the pyramid: pixels of the image by its own, and the extractor on it alone.
-
-    One extractor over all levels builds the pyramid where it detects, and again where it describes.
-    """
-
-    scale: np.float32
-    orb: cv2.ORB
-
-
 class FeatureExtractor:
     """Extracts the features of images of one camera."""
 
     def __init__(self, config: FeaturesConfig, camera: Camera) -> None:
         self._camera = camera
         self._config = config
-        self._levels = _levels(config)
+        factor = float(np.float32(config.scale_factor))
+        self._scales = np.array([factor**i for i in range(config.n_levels)], np.float32)
+        self._levels, self._pyramid = np.zeros((1, 4), np.int64), np.zeros(0, np.uint8)
         self._threshold = FAST_THRESHOLD
         self.feature_ratio = 1.0
         """Ratio of the configured number of features to extract."""
@@ -100,25 +92,11 @@ class FeatureExtractor:
 
     def extract(self, grey: Bytes) -> Features:
         """Features of an image (H, W); possibly none."""
-        shrunk = self._pyramid(grey)
-        found = self._detect(shrunk)
-        pixels = np.concatenate(
-            [_pixels(f) * level.scale for f, level in zip(found, self._levels, strict=True)]
-        )
-        octaves = np.repeat(np.arange(len(found)), [len(f) for f in found])
-        chosen = self._spread(pixels, found)
-        pixels, octaves = pixels[chosen], octaves[chosen]
-        bounds = np.searchsorted(octaves, np.arange(len(found) + 1))
-        keypoints = [k for f in found for k in f]
-        described = [keypoints[i] for i in chosen.tolist()]
-        descriptors = np.zeros((len(chosen), 32), np.uint8)
-        for image, level, start, stop in zip(
-            shrunk, self._levels, bounds[:-1].tolist(), bounds[1:].tolist(), strict=True
-        ):
-            if start < stop:
-                _, words = level.orb.compute(image, described[start:stop])
-                descriptors[start:stop] = words
-        angles = np.array([k.angle for k in described], np.float32)
+        self._shrink(grey)
+        at, octaves, pixels, response = self._detect()
+        chosen = spread(pixels, response, CELL_PX, self._n_wanted)
+        octaves, pixels = octaves[chosen], pixels[chosen]
+        angles, descriptors = described(self._pyramid, self._levels, octaves, at[chosen])
         # levels are shrunk about the image's corner, not about the centre of its first pixel
         half = 0.5 * (self._config.scale_factor**octaves - 1.0)
         pixels += half[:, None].astype(np.float32)
@@ -134,28 +112,24 @@ class FeatureExtractor:
     def _n_wanted(self) -> int:
         return round(self.feature_ratio * self._config.n_features)
 
-    def _pyramid(self, grey: Bytes) -> list[Bytes]:
-        """The image at all levels, each shrunk from the one before."""
-        height, width = grey.shape
-        shrunk = [grey]
-        for level in self._levels[1:]:
-            by = np.float32(1.0) / level.scale
-            size = round(float(width * by)), round(float(height * by))
-            shrunk.append(
-                np.asarray(
-                    cv2.resize(shrunk[-1], size, interpolation=cv2.INTER_LINEAR_EXACT), np.uint8
-                )
-            )
-        return shrunk
+    def _shrink(self, grey: Bytes) -> None:
+        """Fill the pyramid by the image at all levels, each shrunk from the one before."""
+        if grey.shape != (self._levels[0, 2], self._levels[0, 1]):
+            self._levels = _levels(grey.shape, self._scales, 4 * self._config.n_features)
+            self._pyramid = np.empty(self._levels[:, 1:3].prod(1).sum(), np.uint8)
+        for i, (start, width, height, _) in enumerate(self._levels.tolist()):
+            level = self._pyramid[start : start + width * height].reshape(height, width)
+            if i == 0:
+                level[:] = grey
+            else:
+                cv2.resize(grey, (width, height), level, interpolation=cv2.INTER_LINEAR_EXACT)
+            grey = level
 
-    def _detect(self, shrunk: list[Bytes]) -> list[Sequence[cv2.KeyPoint]]:
-        """FAST corners of each level with an adaptive threshold: low contrast has some too."""
+    def _detect(self) -> tuple[Ints, Ints, Floats, Floats]:
+        """FAST corners with an adaptive threshold: low contrast has some too; as of `corners`."""
         while True:
-            found: list[Sequence[cv2.KeyPoint]] = []
-            for image, level in zip(shrunk, self._levels, strict=True):
-                level.orb.setFastThreshold(self._threshold)
-                found.append(level.orb.detect(image, None))
-            n = sum(len(f) for f in found)
+            found = corners(self._pyramid, self._levels, self._scales, self._threshold)
+            n = len(found[0])
             if n >= 1.25 * self._n_wanted or self._threshold <= MIN_FAST_THRESHOLD:
                 break
             self._threshold = max(MIN_FAST_THRESHOLD, int(self._threshold * 0.7))
@@ -163,24 +137,11 @@ class FeatureExtractor:
             self._threshold = min(MAX_FAST_THRESHOLD, self._threshold + 1)
         return found
 
-    def _spread(self, pixels: Floats, found: list[Sequence[cv2.KeyPoint]]) -> Ints:
-        response = np.array([k.response for f in found for k in f], np.float32)
-        return spread(pixels, response, CELL_PX, self._n_wanted)
 
-
-def _levels(config: FeaturesConfig) -> list[_Level]:
-    """Levels of the pyramid: ORB on one image each, as it divides features over its own levels."""
-    factor = float(np.float32(config.scale_factor))
-    by = np.float32(1.0 / factor)
-    wanted = np.float32(4 * config.n_features) * (1 - by) / (1 - by**config.n_levels)
-    left, levels = 4 * config.n_features, []
-    for i in range(config.n_levels):
-        n = round(float(wanted)) if i < config.n_levels - 1 else max(left, 0)
-        orb = cv2.ORB.create(nfeatures=n, nlevels=1)
-        levels.append(_Level(np.float32(factor**i), orb))
-        left, wanted = left - n, wanted * by
-    return levels
-
-
-def _pixels(keypoints: Sequence[cv2.KeyPoint]) -> Floats:
-    return np.array(cv2.KeyPoint.convert(keypoints), np.float32).reshape(-1, 2)
+def _levels(shape: tuple[int, ...], scales: Floats, n_features: int) -> Ints:
+    """Levels (L, 4) of a pyramid as of `corners`, with corners in proportion to their sides."""
+    by = np.float32(1.0) / scales
+    whole = np.array(shape[::-1], np.float32)
+    sizes = np.rint(whole * by[:, None]).astype(np.int64)
+    starts = np.append(0, np.cumsum(sizes.prod(1))[:-1])
+    return np.column_stack([starts, sizes, np.rint(n_features * by / by.sum())]).astype(np.int64)

@@ -1,4 +1,4 @@
-"""ORB level by level against one extractor over all levels, and the lens in a compiled loop."""
+"""Corners and descriptors in compiled loops against OpenCV's, and the lens in one."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ def textured(width: int, height: int) -> Bytes:
 
 @pytest.mark.parametrize("size", [(640, 480), (333, 257)])
 @pytest.mark.parametrize("scale_factor", [1.2, 1.37])
-def test_levels_extract_what_one_extractor_does(size: tuple[int, int], scale_factor: float) -> None:
+def test_features_are_those_of_opencv(size: tuple[int, int], scale_factor: float) -> None:
     config = FeaturesConfig(n_features=300, n_levels=6, scale_factor=scale_factor)
     grey, camera = textured(*size), Camera(*size, 500.0, 500.0, size[0] / 2, size[1] / 2)
     found = FeatureExtractor(config, camera).extract(grey)
-    orb = cv2.ORB.create(nfeatures=4 * 300, scaleFactor=scale_factor, nlevels=6, fastThreshold=12)
-    keypoints = list(orb.detect(grey, None))
+    orb = cv2.ORB.create(4 * 300, scaleFactor=scale_factor, nlevels=6, fastThreshold=12)
+    # of the levels that have too many, OpenCV leaves the strongest in another order
+    keypoints = sorted(orb.detect(grey, None), key=lambda k: (k.octave, k.pt[1], k.pt[0]))
     assert len(keypoints) > 1.25 * 300
     pixels = np.array([k.pt for k in keypoints], np.float32)
     response = np.array([k.response for k in keypoints], np.float32)
@@ -45,10 +46,12 @@ def test_levels_extract_what_one_extractor_does(size: tuple[int, int], scale_fac
     half = (0.5 * (scale_factor**octaves - 1.0)).astype(np.float32)
     np.testing.assert_array_equal(found.octaves, octaves)
     np.testing.assert_array_equal(found.pixels, pixels[chosen] + half[:, None])
-    np.testing.assert_array_equal(found.descriptors, words)
     np.testing.assert_array_equal(
         found.angles_deg, np.array([k.angle for k in described], np.float32)
     )
+    # where a blurred pixel is half way between two grey levels, rounding is not the same
+    differ = np.unpackbits(found.descriptors ^ np.asarray(words, np.uint8))
+    assert differ.mean() < 1e-4
 
 
 def test_an_image_without_corners_has_no_features() -> None:
