@@ -201,7 +201,7 @@ def test_any_size_gives_finite_values(
 
 
 def test_image_too_large_for_the_device_is_an_error(device: ComputeDevice) -> None:
-    with pytest.raises(DeviceError, match=r"raise depth\.stride"):
+    with pytest.raises(DeviceError, match=r"raise expert\.depth\.stride"):
         engine(device, 100_000, 90_000, stride=1)
 
 
