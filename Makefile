@@ -52,7 +52,7 @@ reference: opencl
 	mkdir -p sample/reference
 	cp out/reference/trajectory.tum out/reference/cloud.ply out/reference/report.json sample/reference
 
-# config/companion.toml and docs/settings.md, after a change to companion/config.
+# config/companion.toml, docs/settings.md and docs/commands.md, after a change to companion/config or companion/app/cli.
 settings: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.support.settings_text
 

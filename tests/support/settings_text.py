@@ -1,4 +1,7 @@
-"""config/companion.toml and docs/settings.md, made of companion/config by `make settings`."""
+"""config/companion.toml and docs/settings.md, made of companion/config.
+
+`make settings` writes them, and docs/commands.md.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from typing import get_type_hints
 
 from companion.config import Config
 from companion.page.setting_texts import PURPOSES, Setting, settings
+from tests.support.commands_text import commands_page
 
 ROOT = Path(__file__).parents[2]
 TOML_HEAD = """\
@@ -78,9 +82,10 @@ def _comment(text: str) -> str:
 
 
 def main() -> None:
-    """Write both."""
+    """Write them."""
     (ROOT / "config/companion.toml").write_text(described_toml(), "utf-8")
     (ROOT / "docs/settings.md").write_text(settings_page(), "utf-8")
+    (ROOT / "docs/commands.md").write_text(commands_page(), "utf-8")
 
 
 if __name__ == "__main__":

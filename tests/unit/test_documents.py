@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from companion import __version__
+from companion.app.cli import command_parser
 from companion.config_file import current_key, load_config
+from tests.support.commands_text import arguments_of, commands_of, commands_page
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -115,6 +117,17 @@ def test_settings_in_texts_are_those_of_this_version(tmp_path: Path) -> None:
             (tmp_path / "block.toml").write_text(block, "utf-8")
             load_config(tmp_path / "block.toml", warn=old.append)
     assert not old
+
+
+def test_the_page_of_commands_is_made_of_the_parsers() -> None:
+    assert (DOCS / "commands.md").read_text("utf-8") == commands_page()
+
+
+def test_each_argument_of_a_command_says_what_it_is() -> None:
+    for name, text, parser in commands_of(command_parser()):
+        assert text, name
+        for each in arguments_of(parser):
+            assert each.help and not each.help.startswith("("), f"{name}: {each.dest}"
 
 
 def test_benchmarks_that_texts_name_are_there() -> None:

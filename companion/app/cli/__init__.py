@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
-    arguments = _parser().parse_args(argv)
+    arguments = command_parser().parse_args(argv)
     with StopSignals() as signals:
         try:
             return COMMANDS[arguments.command](arguments, signals)
@@ -124,7 +124,8 @@ def _reader_gone(stream: TextIO) -> bool:
     return any(events & (select.POLLERR | select.POLLHUP) for _, events in poll.poll(0))
 
 
-def _parser() -> argparse.ArgumentParser:
+def command_parser() -> argparse.ArgumentParser:
+    """Parser of the whole command line, with a parser for each command."""
     parser = argparse.ArgumentParser(
         prog="companion",
         description="Visual SLAM and dense metric mapping for drones.",

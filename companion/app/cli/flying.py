@@ -157,27 +157,30 @@ def add_parsers(commands: Any) -> None:
     support = commands.add_parser(
         "support", parents=[configuration()],
         help="pack what a maintainer needs to help into one file",
-        description="Versions, settings without passwords, health, journal, list of flights and "
-        "the end of the newest recording, in one .zip. Says what is in it, and what that shows.",
+        description="Pack versions, settings without passwords, health, journal, list of "
+        "flights and the end of the newest recording into one .zip. Say what is in it, and what "
+        "that shows.",
     )  # fmt: skip
     support.add_argument(
         "--out", type=Path, default=Path("companion-support.zip"), metavar="FILE",
-        help="(default: %(default)s)",
+        help="what to write (default: %(default)s)",
     )  # fmt: skip
     support.add_argument(
-        "--flights", type=Path, metavar="DIR", help="folder of all flights (default: as `flights`)"
-    )
+        "--flights", type=Path, metavar="DIR",
+        help="folder of all flights (default: as for flights)",
+    )  # fmt: skip
     support.add_argument(
         "--seconds", type=within(0, 300), default=10.0, metavar="S",
-        help="of the newest recording, its pictures too; 0 for none (default: 10)",
+        help="seconds of the newest recording, with its pictures; 0 for none (default: 10)",
     )  # fmt: skip
-    status.add_argument("--watch", action="store_true", help="again every second, until Ctrl-C")
+    status.add_argument("--watch", action="store_true", help="again every second until Ctrl-C")
 
     page = commands.add_parser(
         "page", parents=[configuration()],
         help="show where the drone's page is, and the codes that pair a device with it",
-        description="The page is served by `companion run` at page.listen. A browser on another "
-        "machine needs one of the codes: the first to look on, the second to change things.",
+        description="Show where the drone's page is, which `companion run` serves at page.listen. "
+        "A browser on another machine needs one of the codes: the first to look on, the second to "
+        "change things.",
     )  # fmt: skip
     page.add_argument(
         "--new-codes", action="store_true", help="draw other codes: every paired device is out"

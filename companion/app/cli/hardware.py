@@ -167,14 +167,14 @@ def add_parsers(commands: Any) -> None:
         help="charuco:COLUMNSxROWS:SQUARE_M:MARKER_M:DICTIONARY or chessboard:9x6:SQUARE_M, whose "
         "numbers are those of inner corners (default: %(default)s)",
     )  # fmt: skip
-    calibrate.add_argument("--name", help="what to call the camera")
+    calibrate.add_argument("--name", help="name of the camera, and of its file")
     calibrate.add_argument(
         "--out", type=Path, default=Path("config/cameras"), metavar="DIR",
         help="where to write (default: %(default)s)",
     )  # fmt: skip
     calibrate.add_argument(
         "--model", default="auto", choices=("auto", "radtan", "equidistant"),
-        help="of distortion (default: whichever fits views best that it was not fitted to)",
+        help="distortion model (default: whichever fits views best that it was not fitted to)",
     )  # fmt: skip
     calibrate.add_argument(
         "--print-board", type=Path, metavar="FILE", help="only write the board, .pdf or .png"
@@ -197,9 +197,9 @@ def add_parsers(commands: Any) -> None:
         description="Read the autopilot's parameters over the configured link and name each that "
         "stands in the way. Exit status 1 where there is one.",
     )  # fmt: skip
-    doctor.add_argument("--write", action="store_true", help="set them, after asking")
+    doctor.add_argument("--write", action="store_true", help="set these parameters, after asking")
     doctor.add_argument(
         "--only", action="append", default=[], metavar="NAME",
         help="with --write, set this parameter and no others; can be given again",
     )  # fmt: skip
-    doctor.add_argument("--yes", action="store_true", help="do not ask")
+    doctor.add_argument("--yes", action="store_true", help="with --write, do not ask")

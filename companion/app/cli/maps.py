@@ -11,6 +11,9 @@ from companion.app.cli.options import Command, amount, json_option, made_folder
 from companion.app.stopping import StopSignals
 from companion.errors import InputError
 
+MAP = "a site map, or the folder of a run"
+NEW_MAP = "a new site map"
+
 
 def _map(arguments: argparse.Namespace, signals: StopSignals) -> int:
     """Show, verify, export, merge, prune or save; 1 where a map is damaged."""
@@ -53,29 +56,32 @@ def add_parsers(commands: Any) -> None:
     )  # fmt: skip
     whats = of_map.add_subparsers(dest="what", required=True, metavar="WHAT")
     given = argparse.ArgumentParser(add_help=False)
-    given.add_argument("map", type=Path, metavar="MAP", help="a site map, or the folder of a run")
+    given.add_argument("map", type=Path, metavar="MAP", help=MAP)
 
     whats.add_parser(
-        "show", parents=[given, json_option()], help="what it is of, and how well it is placed"
+        "show", parents=[given, json_option()],
+        help="say what one is of, and how well it is georeferenced",
+    )  # fmt: skip
+    verified = whats.add_parser(
+        "verify", help="check whether maps are whole; exit status 1 where one is not"
     )
-    verified = whats.add_parser("verify", help="whether maps are whole; 1 where one is not")
-    verified.add_argument("maps", type=Path, nargs="+", metavar="MAP")
+    verified.add_argument("maps", type=Path, nargs="+", metavar="MAP", help=MAP)
     exported = whats.add_parser(
-        "export", parents=[given], help="points.ply, keyframes.tum and map.json for other programs"
+        "export", parents=[given], help="write points.ply, keyframes.tum and map.json"
     )
-    exported.add_argument("--out", type=Path, required=True, metavar="DIR")
+    exported.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for them")
     merged = whats.add_parser(
-        "merge", help="one map of several flights over a site, adjusted as one"
+        "merge", help="make one map of those of several flights over a site, adjusted as one"
     )
-    merged.add_argument("maps", type=Path, nargs="+", metavar="MAP")
-    merged.add_argument("--out", type=Path, required=True, metavar="FILE")
+    merged.add_argument("maps", type=Path, nargs="+", metavar="MAP", help=MAP)
+    merged.add_argument("--out", type=Path, required=True, metavar="FILE", help=NEW_MAP)
     pruned = whats.add_parser(
         "prune", parents=[given], help="leave out keyframes that others make redundant"
     )
     pruned.add_argument(
         "--within", type=amount, default=3.0, metavar="DEG",
-        help="of another keyframe, as an angle seen from its points (default: 3)",
+        help="largest angle, seen from its points, to one that stays, degrees (default: 3)",
     )  # fmt: skip
-    pruned.add_argument("--out", type=Path, required=True, metavar="FILE")
+    pruned.add_argument("--out", type=Path, required=True, metavar="FILE", help=NEW_MAP)
     saved = whats.add_parser("save", parents=[given], help="keep the map of a run elsewhere")
-    saved.add_argument("--out", type=Path, required=True, metavar="FILE")
+    saved.add_argument("--out", type=Path, required=True, metavar="FILE", help=NEW_MAP)

@@ -48,7 +48,7 @@ def add_parsers(commands: Any) -> None:
         "of REMODE's test set or of TUM RGB-D, with poses.txt and K.txt, or a flight with "
         "trajectory.tum.",
     )  # fmt: skip
-    depth.add_argument("dataset", type=Path, metavar="DATASET")
+    depth.add_argument("dataset", type=Path, metavar="DATASET", help="its folder")
     depth.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder for the results"
     )

@@ -155,18 +155,19 @@ def add_parsers(commands: Any) -> None:
         "Exit status 1 where a limit is given and not kept. With --maps: what is gone, new or "
         "moved at a site between two flights.",
     )  # fmt: skip
-    compare.add_argument("run_a", type=Path, metavar="A")
-    compare.add_argument("run_b", type=Path, metavar="B")
+    compare.add_argument("run_a", type=Path, metavar="A", help="what --out of one replay was")
+    compare.add_argument("run_b", type=Path, metavar="B", help="and of the other")
     compare.add_argument(
         "--maps", action="store_true", help="A and B are site maps of two flights over one site"
     )
     compare.add_argument("--out", type=Path, metavar="DIR", help="write a report with plots there")
     compare.add_argument(
-        "--max-apart", type=amount, metavar="M", help="poses at most so far apart, RMS"
-    )
+        "--max-apart", type=amount, metavar="M",
+        help="limit: RMS distance between their poses, metres",
+    )  # fmt: skip
     compare.add_argument(
         "--max-cloud", type=amount, metavar="M",
-        help="95 %% of points at most so far from the other",
+        help="limit: distance that 95 %% of points keep to the other cloud, metres",
     )  # fmt: skip
 
     batch = commands.add_parser(
@@ -174,15 +175,18 @@ def add_parsers(commands: Any) -> None:
         description="Replay each flight into a folder of DIR, and write DIR/index.html with a row "
         "for each. What is done already is not done again. Exit status 1 where a flight failed.",
     )  # fmt: skip
-    batch.add_argument("flights", type=Path, nargs="+", metavar="FLIGHT")
-    batch.add_argument("--out", type=Path, required=True, metavar="DIR")
+    batch.add_argument("flights", type=Path, nargs="+", metavar="FLIGHT", help="as for replay")
+    batch.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of the results' folders"
+    )
     batch.add_argument(
         "--merge", action="store_true",
         help="make one site map of all, DIR/site.map, and more where they show no common place",
     )  # fmt: skip
     batch.add_argument(
-        "--workers", type=count, metavar="N", help="processes (default: one per core)"
-    )
+        "--workers", type=count, metavar="N",
+        help="replays at a time, each in a process (default: one per core)",
+    )  # fmt: skip
     batch.add_argument(
         "--scheduler", metavar="ADDRESS",
         help="a Dask cluster that sees the same files, as tcp://192.168.1.5:8786",
@@ -199,44 +203,51 @@ def _add_flights(commands: Any) -> None:
     flights = commands.add_parser("flights", help="recordings of live flights")
     does = flights.add_subparsers(dest="what", required=True, metavar="WHAT")
 
-    does.add_parser("list", parents=[place, json_option()], help="which there are")
-    show = does.add_parser("show", parents=[place, json_option()], help="what is in one")
-    trim = does.add_parser("trim", parents=[place], help="a part of one, as a recording")
+    does.add_parser("list", parents=[place, json_option()], help="list them")
+    show = does.add_parser("show", parents=[place, json_option()], help="say what is in one")
+    trim = does.add_parser("trim", parents=[place], help="write a part of one as a recording")
     trim.add_argument("--start", type=seconds, metavar="S", help="from this second on")
     trim.add_argument("--stop", type=seconds, metavar="S", help="up to this second")
-    trim.add_argument("--out", type=Path, required=True, metavar="FILE")
+    trim.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .mcap")
     export = does.add_parser(
-        "export", parents=[place], help="one as a flight folder, for other programs",
+        "export", parents=[place], help="write one as a flight folder, for other programs",
         description="Write pictures as they were recorded, frames.csv, camera.json, config.toml "
         "and flight.tlog, or telemetry.csv where no bytes of a link were recorded.",
     )  # fmt: skip
-    export.add_argument("--out", type=Path, required=True, metavar="DIR")
+    export.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
     mission = does.add_parser(
-        "mission", parents=[place], help="its path, or the way back, as a mission",
+        "mission", parents=[place], help="write its path, or the way back, as a mission",
         description="Write the path of a flight as waypoints for a ground station: FILE.plan for "
         "QGroundControl, FILE.waypoints for Mission Planner and MAVProxy. Heights are above sea "
         "level. Check it before it is flown: nothing of it looks for obstacles.",
     )  # fmt: skip
-    mission.add_argument("--out", type=Path, required=True, metavar="FILE")
+    mission.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help="way.plan or way.waypoints"
+    )
     mission.add_argument(
         "--within", type=amount, default=0.5, metavar="M",
-        help="leave out places this near to the line between others (default: 0.5)",
+        help="leave out waypoints this near to the line between others, metres (default: 0.5)",
     )  # fmt: skip
-    mission.add_argument("--back", action="store_true", help="from the end to the beginning")
+    mission.add_argument(
+        "--back", action="store_true", help="the way back: from the end to the beginning"
+    )
     for parser in (show, trim, export, mission):
         parser.add_argument("flight", metavar="FLIGHT", help="name, folder or file")
     verify = does.add_parser(
         "verify", parents=[place], help="check all checksums",
-        description="Exit status 1 where a recording is damaged or cut short. Changes nothing.",
+        description="Check all checksums of recordings. Exit status 1 where one is damaged or cut "
+        "short. Changes nothing.",
     )  # fmt: skip
     repair = does.add_parser(
         "repair", parents=[place], help="end those that were cut short, where they lie",
-        description="What opens a recording does the same; the daemon does it after its start, for "
-        "all. Exit status 1 where one cannot be repaired.",
+        description="End recordings that were cut short, where they lie. What opens one does the "
+        "same; the daemon does it after its start, for all. Exit status 1 where one cannot be "
+        "repaired.",
     )  # fmt: skip
     repair.add_argument(
-        "--gently", action="store_true", help="slowly, and without a last line; as the daemon does"
-    )
+        "--gently", action="store_true",
+        help="as the daemon does: only with processors and disk that nobody else wants",
+    )  # fmt: skip
     for parser in (verify, repair):
         parser.add_argument(
             "flights_named", metavar="FLIGHT", nargs="*", help="name, folder or file (default: all)"
@@ -247,6 +258,8 @@ def _add_flights(commands: Any) -> None:
         'file named "keep" in its folder stays. Of several conditions all must hold.',
     )  # fmt: skip
     prune.add_argument("--keep-newest", type=number, metavar="N", help="all but the newest N")
-    prune.add_argument("--older-than", type=amount, metavar="DAYS")
-    prune.add_argument("--free", type=amount, metavar="MB", help="until so much room is free")
-    prune.add_argument("--dry-run", action="store_true", help="only say which")
+    prune.add_argument("--older-than", type=amount, metavar="DAYS", help="older than so many days")
+    prune.add_argument(
+        "--free", type=amount, metavar="MB", help="only until so many megabytes are free"
+    )
+    prune.add_argument("--dry-run", action="store_true", help="only say which would be deleted")

@@ -210,7 +210,7 @@ def add_parsers(commands: Any) -> None:
         description="Replay the sample flight that comes with the program, or another. It needs an "
         "OpenCL device, as every dense map does, and takes a minute or two.",
     )  # fmt: skip
-    demo.add_argument("flight", type=Path, nargs="?", metavar="FLIGHT")
+    demo.add_argument("flight", type=Path, nargs="?", metavar="FLIGHT", help="as for replay")
     demo.add_argument(
         "--out", type=Path, default=Path("out/demo"), metavar="DIR",
         help="folder for the results (default: %(default)s)",
@@ -222,15 +222,15 @@ def add_parsers(commands: Any) -> None:
         description="Read a flight of any format and write it, all on one clock: as a folder with "
         "pictures, times, calibration and telemetry, or as FILE.mcap, a recording.",
     )  # fmt: skip
-    imported.add_argument("source", type=Path, metavar="SOURCE", help="as FLIGHT of replay")
+    imported.add_argument("source", type=Path, metavar="SOURCE", help="as for replay")
     imported.add_argument(
         "--out", type=Path, required=True, metavar="OUT", help="a new folder, or FILE.mcap"
     )
 
     export = commands.add_parser(
         "export", parents=[configuration()], help="write a replay's results in other formats",
-        description="Clouds, rasters and paths for other programs, from the folder of a finished "
-        "replay, with a statement of accuracy beside each.",
+        description="Write clouds, rasters and paths for other programs, from the folder of a "
+        "finished replay, with a statement of accuracy beside each.",
     )  # fmt: skip
     export.add_argument("run", type=Path, metavar="RUN", help="what --out of the replay was")
     export.add_argument(
@@ -245,20 +245,22 @@ def add_parsers(commands: Any) -> None:
     export.add_argument("--out", type=Path, metavar="DIR", help="folder for them (default: RUN)")
 
     film = commands.add_parser(
-        "film", parents=[configuration()], help="a film of a flight, to be shown",
-        description="Path and cloud as they grow, beside the picture: FILE.mp4 or FILE.webp.",
+        "film", parents=[configuration()], help="make a film of a flight, to be shown",
+        description="Make a film of path and cloud as they grow, beside the picture.",
     )  # fmt: skip
     film.add_argument("run", type=Path, metavar="RUN", help="what --out of the replay was")
-    film.add_argument("--out", type=Path, required=True, metavar="FILE")
+    film.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .mp4 or .webp")
     film.add_argument(
         "--flight", type=Path, metavar="FLIGHT", help="what was replayed: its pictures"
     )
     film.add_argument(
-        "--seconds", type=within(1, 600), default=30.0, metavar="S", help="its length (default: 30)"
-    )
+        "--seconds", type=within(1, 600), default=30.0, metavar="S",
+        help="its length in seconds (default: 30)",
+    )  # fmt: skip
     film.add_argument(
-        "--height", type=whole_within(120, 2160), default=720, metavar="PX", help="(default: 720)"
-    )
+        "--height", type=whole_within(120, 2160), default=720, metavar="PX",
+        help="its height in pixels (default: 720)",
+    )  # fmt: skip
     film.add_argument(
         "--rate", type=whole_within(1, 60), default=25, metavar="HZ",
         help="frames a second (default: 25)",
