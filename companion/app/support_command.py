@@ -102,7 +102,7 @@ def _parts(config: Config, flights: Path, seconds: float) -> Iterator[Part]:
     kept = config.control.keep
     yield _tried(
         Part("kept_parameters.toml", "what a ground station has set", "nothing else"),
-        lambda: _file(Path(kept)) if kept else _none("control.keep names no file"),
+        lambda: _file(Path(kept)) if kept else _none("expert.control.keep names no file"),
     )
     yield _tried(
         Part("parameters.txt", "what `companion doctor` says of the autopilot's parameters",

@@ -156,5 +156,5 @@ class ControlConfig:
 
     enabled: bool = True
     """Let ground stations give commands and set parameters."""
-    keep: str = ""
+    keep: Expert[str] = ""
     """TOML file that keeps settings from the ground, read after all else; "" keeps nothing."""

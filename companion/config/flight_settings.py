@@ -73,7 +73,7 @@ class MapConfig:
 class ExportConfig:
     """Exports that a replay writes beside its results; `companion export` does so afterwards."""
 
-    formats: tuple[str, ...] = ()
+    formats: Expert[tuple[str, ...]] = ()
     """ply, pcd, las, laz, copc, dsm, ortho, mosaic, glb, mesh, textured, tiles, colmap, nerfstudio,
     tum, kitti, euroc, gpx, kml, geojson."""
     epsg: Expert[Annotated[int, Meta(ge=0, le=999999)]] = 0

@@ -58,9 +58,9 @@ class DistributedConfig:
     """Name of the drone in keys; nodes of one drone have the same."""
     listen: tuple[str, ...] = ()
     """Endpoints to listen at, as tcp/0.0.0.0:7447; none: loopback, if tracking runs here."""
-    connect: tuple[str, ...] = ()
-    """Endpoints to connect to, as tcp/192.168.1.20:7447."""
-    ros_domain: Annotated[int, Meta(ge=-1, le=232)] = -1
+    connect: Expert[tuple[str, ...]] = ()
+    """Endpoints to connect to, as tcp/192.168.1.20:7447; `companion run --join` gives others."""
+    ros_domain: Expert[Annotated[int, Meta(ge=-1, le=232)]] = -1
     """Pose, cloud and keyframes' pictures for ROS 2 too, in this domain, as its rmw_zenoh finds
     them; -1: none."""
     stages: Expert[tuple[str, ...]] = ("tracking", "depth", "cloud")

@@ -18,7 +18,7 @@ PURPOSES = {
     "Computer": ("computer",),
     "Camera": ("camera", "mount"),
     "Autopilot": ("link", "router", "telemetry", "feedback", "landing", "gps", "control"),
-    "Flights, and what is kept of them": ("daemon", "recorder", "map", "export"),
+    "Flights, and what is kept of them": ("daemon", "recorder", "map"),
     "Dense map": ("depth", "cloud", "opencl"),
     "Looking on, other machines": ("page", "stream", "video", "distributed"),
 }

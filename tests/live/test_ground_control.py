@@ -51,7 +51,7 @@ def flying(folder: Path, port: int) -> Iterator[Flying]:
     settings = (
         f'router.clients=["tcpin:127.0.0.1:{port}"]',
         f"stream.listen=127.0.0.1:{free_port(socket.SOCK_STREAM)}",
-        f"control.keep={folder}/kept.toml", "depth.enabled=true", "expert.depth.stride=8",
+        f"expert.control.keep={folder}/kept.toml", "depth.enabled=true", "expert.depth.stride=8",
         "expert.feedback.min_quality=15", "expert.features.n_features=500",
     )  # fmt: skip
     dark = Flying(folder, *settings, program=UNGOVERNED)

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 DESCRIBED, PAGE = ROOT / "config/companion.toml", ROOT / "docs/settings.md"
 BEFORE = ROOT / "tests/support/reference/companion_0_1_0.toml"
 SINCE = {
-    "camera.exposure", "computer.profile", "distributed.ros_domain",
+    "camera.exposure", "computer.profile", "expert.distributed.ros_domain",
     "camera.readout_ms", "expert.export.mesh_m", "expert.link.gimbal_hz",
     "expert.mount.gimbal_delay_ms",
     "expert.mount.gimbal_sigma_deg", "mount.type", "feedback.flow", "feedback.global_position",
@@ -285,8 +285,8 @@ def test_passwords_are_not_shown() -> None:
     assert without_passwords("run --set camera.url=rtsp://a:b@c/") == (
         "run --set camera.url=rtsp://a:***@c/"
     )
-    joined = load_config(None, ['distributed.connect=["tls/10.0.0.2:7447?password=s3cret"]'])
-    assert shown(joined)["distributed"]["connect"] == ("tls/10.0.0.2:7447?password=***",)
+    found = load_config(None, ['expert.distributed.connect=["tls/10.0.0.2:7447?password=s3cret"]'])
+    assert shown(found)["expert"]["distributed"]["connect"] == ("tls/10.0.0.2:7447?password=***",)
 
 
 @pytest.mark.parametrize("text", [

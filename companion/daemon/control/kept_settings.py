@@ -12,7 +12,7 @@ from companion.config_file import changed_by, toml_value, with_value
 from companion.daemon.control.flight_parameters import PARAMETERS, FlightParameter
 from companion.errors import ConfigError
 
-HEAD = "# What the ground has set over MAVLink; control.keep names this file.\n"
+HEAD = "# What the ground has set over MAVLink; expert.control.keep names this file.\n"
 KEYS = {parameter.full_key for parameter in PARAMETERS.values()}
 
 

@@ -458,7 +458,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", run, "--as", "las, GPX", "--out", str(out)]) == 0
     assert capsys.readouterr().out == f"export: {out}/cloud.las\nexport: {out}/trajectory.gpx\n"
     assert len(list(out.iterdir())) == 4
-    assert main(["export", run, "--set", 'export.formats=["kml"]']) == 0
+    assert main(["export", run, "--set", 'expert.export.formats=["kml"]']) == 0
     assert (tmp_path / "run" / "trajectory.kml").exists()
     assert main(["export", run]) == 2
     assert main(["export", run, "--as", "dwg"]) == 2
