@@ -1,4 +1,4 @@
-"""Notes of a flight beside its measurements: bytes of the link, steps of the gates, health.
+"""Notes of a flight beside its measurements: of the link, the gates, obstacles, and health.
 
 They go to the recording, for a replay as flown.
 """
@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+
+from companion.messages import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,18 @@ class GateStep:
     values: Mapping[str, Any]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ObstaclePoints:
+    """Points (N, 3) of one keyframe, camera frame, in which obstacles are looked for from then on.
+
+    `t_ns` is the time of the keyframe, whose points before they replace.
+    """
+
+    t_ns: int
+    keyframe_id: int
+    points_camera: Floats
+
+
 @dataclass(frozen=True, slots=True)
 class HealthNote:
     """Health of the daemon: status document, state of the clock filter, origin if known."""
@@ -53,4 +67,4 @@ class HealthNote:
     document: Mapping[str, Any]
 
 
-FlightNote = LinkBytes | GateStep | HealthNote
+FlightNote = LinkBytes | GateStep | ObstaclePoints | HealthNote

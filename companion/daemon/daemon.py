@@ -123,7 +123,7 @@ class Daemon:
         self._notes = RecorderNotes(clock, flights, watch, self._link)
         if self._link is not None:
             self._reports = VehicleReports(
-                self._link, clock, watch, config, flight_recording(config, flights)
+                self._link, clock, watch, config, flights.take, flight_recording(config, flights)
             )
         self._starts = starts = FlightStarts(
             settings, self._feed, flights, self._senders, self._reports, watch, journal, self._stop,
@@ -137,7 +137,7 @@ class Daemon:
             )  # fmt: skip
         self._outputs = FlightOutputs(
             flights, starts, watch, self._senders,
-            self._reports if config.feedback.obstacle_distance else None, self._ground, journal,
+            self._reports.obstacles if self._reports is not None else None, self._ground, journal,
             clock, self._on_warned, self._soon,
         )  # fmt: skip
         self._checks = PeriodicChecks(

@@ -10,8 +10,8 @@ from companion.daemon.flight_starts import FlightStarts
 from companion.daemon.flights.flights import Flights
 from companion.daemon.flights.live_flight import Given, Listener, LiveFlight
 from companion.daemon.health_watch import HealthWatch
+from companion.daemon.obstacle_reports import ObstacleReports
 from companion.daemon.pose.senders import Senders
-from companion.daemon.vehicle_reports import VehicleReports
 from companion.messages import NO_PICTURE, Georeferenced, Odometry, Warned
 from companion.runtime.stage_protocol import ResultsWritten, Snapshot
 from companion.timing.clock import FlightClock
@@ -23,16 +23,16 @@ NOT_WRITTEN = "the results so far could not be written"
 class FlightOutputs:
     """Listeners of flights. What they take comes from any thread; `soon` calls in the event loop.
 
-    `reports` are those that obstacles are looked for by, if any.
+    `obstacles` are looked for, or not.
     """
 
     def __init__(
         self, flights: Flights, starts: FlightStarts, watch: HealthWatch, senders: Senders | None,
-        reports: VehicleReports | None, ground: GroundControl | None, journal: Journal,
+        obstacles: ObstacleReports | None, ground: GroundControl | None, journal: Journal,
         clock: FlightClock, warn: Callable[[Warned], None], soon: Callable[..., None],
     ) -> None:  # fmt: skip
         self._flights, self._starts, self._watch = flights, starts, watch
-        self._senders, self._reports, self._ground = senders, reports, ground
+        self._senders, self._obstacles, self._ground = senders, obstacles, ground
         self._journal, self._clock, self._warn, self._soon = journal, clock, warn, soon
 
     def listener(self, flight: LiveFlight) -> Listener:
@@ -51,7 +51,7 @@ class FlightOutputs:
             self._warn(warning)
             to_senders(warning)
 
-        reports = self._reports
+        obstacles = self._obstacles
         return Listener(
             given=current(self._given),
             warned=warned,
@@ -59,7 +59,7 @@ class FlightOutputs:
             unusable=lambda why: self._soon(self._starts.stage_unusable, why),
             results_written=self._results_written,
             points_made=current(self._watch.points_made),
-            mapped=current(reports.take) if reports is not None else None,
+            mapped=current(obstacles.take) if obstacles is not None else None,
         )
 
     def _given(self, message: Given) -> None:

@@ -1,6 +1,7 @@
 """Obstacles around the vehicle now, of tracks, images, the map, and depth.
 
 Depth of a keyframe comes a second or two late. What is told is confirmed by the newest images.
+A round that is given the same again finds the same, as a replay does.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from companion.flight_notes import ObstaclePoints
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import (
@@ -49,6 +51,24 @@ MOST_WAITING = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Round:
+    """Inputs of one look for obstacles: all that had come at its time.
+
+    `tracks` are the newest that found map points, `track` is the newest of all, and `grey` (H, W)
+    its image, where that is still there. `depths` have come since the round before. `n_taken` is
+    the number of tracks and map updates since the begin of the map.
+    """
+
+    t_ns: int
+    track: Track | None
+    tracks: Sequence[Track]
+    update: MapUpdate | None
+    grey: Bytes | None
+    depths: Sequence[DepthMap | PointChunk]
+    n_taken: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Known:
     """Points around the vehicle, and what confirms them.
 
@@ -67,7 +87,7 @@ class _Known:
 class ObstacleFinder:
     """Obstacles of what is known of one map.
 
-    Frames, what else is taken, and rounds may come in three threads.
+    `take` and `round` are for one thread, frames may come in another, and `look` may be a third.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -78,7 +98,7 @@ class ObstacleFinder:
         self._map: MapUpdate | None = None
         self._cloud = RecentCloud()
         self._waiting: deque[DepthMap | PointChunk] = deque(maxlen=MOST_WAITING)
-        """To be added by the next round to the cloud, which is its thread's alone."""
+        self._n_taken = 0
         self._sight = NewestSight(camera)
         self._greys: deque[tuple[int, Bytes]] = deque(maxlen=MOST_TRACKS)
         """The newest images by their numbers: of one its track comes some images later."""
@@ -86,6 +106,7 @@ class ObstacleFinder:
 
     def take(self, message: Track | MapUpdate | DepthMap | PointChunk) -> None:
         """Take a track, a map update, a depth map or points."""
+        self._n_taken += isinstance(message, Track | MapUpdate)
         if isinstance(message, Track):
             self._track = message
             if message.keypoints_px is not None and not message.backfilled:
@@ -99,14 +120,32 @@ class ObstacleFinder:
         """Take a frame."""
         self._greys.append((frame.seq, frame.grey))
 
-    def obstacles(self, now_ns: int, reach_m: float) -> Obstacles | None:
+    def round(self, now_ns: int, with_image: bool = True) -> Round:
+        """All that a look now goes by; next, it is to be looked at."""
+        track, grey = self._track, None
+        if track is not None and with_image:
+            grey = next((grey for seq, grey in list(self._greys) if seq == track.seq), None)
+        depths = [self._waiting.popleft() for _ in range(len(self._waiting))]
+        return Round(now_ns, track, list(self._tracks), self._map, grey, depths, self._n_taken)
+
+    def look(
+        self, given: Round, parts: Sequence[ObstaclePoints], reach_m: float | None
+    ) -> Obstacles | Array | None:
         """Obstacles by the map's own pose; None while that is unknown or old.
 
-        Known are sectors alone in which one of the newest frames has found points of the map.
+        `parts` are of the round's depths. With a reach, metres, obstacles are per sector; without
+        one they are the nearest (N, 3) in each part of the space around, metres, in body axes: see
+        `companion.obstacles.obstacle_space`.
         """
-        known = self._known(now_ns)
+        for part in parts:
+            self._cloud.add(part)
+        known = self._known(given)
         if known is None:
             return None
+        return self._in_space(known) if reach_m is None else self._in_sectors(known, reach_m)
+
+    def _in_sectors(self, known: _Known, reach_m: float) -> Obstacles:
+        """Known are sectors alone in which one of the newest frames has found points of the map."""
         is_seen = np.zeros(N_SECTORS, bool)
         for keypoints_px, world_from_camera in known.sights:
             is_seen |= sectors_seen(
@@ -127,14 +166,7 @@ class ObstacleFinder:
             is_seen | is_free,
         )
 
-    def in_space(self, now_ns: int) -> Array | None:
-        """The nearest obstacle (N, 3) in each part of the space around, metres, in body axes.
-
-        None while the pose is unknown or old. See `companion.obstacles.obstacle_space`.
-        """
-        known = self._known(now_ns)
-        if known is None:
-            return None
+    def _in_space(self, known: _Known) -> Array:
         pose = known.world_from_body
         is_seen = cells_with(known.things_world_m - pose.translation, pose)
         for keypoints_px, world_from_camera in known.sights:
@@ -142,15 +174,8 @@ class ObstacleFinder:
             is_seen |= cells_with(rays, pose)
         return nearest_in_cells(pose, known.points_world_m, is_seen)
 
-    def _known(self, now_ns: int) -> _Known | None:
-        """All that is known now, by the map's own pose; None while that is unknown or old."""
-        track, tracks, update = self._track, list(self._tracks), self._map
-        while self._waiting:
-            message = self._waiting.popleft()
-            if isinstance(message, DepthMap):
-                self._cloud.add_map(message)
-            else:
-                self._cloud.add(message)
+    def _known(self, given: Round) -> _Known | None:
+        now_ns, track, update = given.t_ns, given.track, given.update
         if (
             track is None or track.state is not TrackState.TRACKING
             or track.map_from_camera is None or now_ns - track.t_ns > MAX_AGE_NS
@@ -165,7 +190,7 @@ class ObstacleFinder:
             world_from_map.apply_to_pose(track.map_from_camera) @ self._camera.camera_from_body
         )
         sights: list[tuple[Floats, Pose]] = []
-        for each in tracks:
+        for each in given.tracks:
             pose = each.map_from_camera
             if pose is None or each.keypoints_px is None or now_ns - each.t_ns > MAX_AGE_NS:
                 continue
@@ -173,7 +198,10 @@ class ObstacleFinder:
             if each is track:
                 found = points_found(update.points_map, each.keypoints_px, pose, self._camera)
                 points = np.concatenate([points, world_from_map.apply(found)])
-        newest, things = self._newest_sight(track, update), np.zeros((0, 3))
+        if given.grey is not None and track.seq != self._sighted:
+            self._sighted = track.seq
+            self._sight.add(track, given.grey, update)
+        newest, things = self._sight.newest, np.zeros((0, 3))
         if newest is None or now_ns - newest.t_ns > MAX_AGE_NS:
             newest = None
         else:
@@ -181,12 +209,3 @@ class ObstacleFinder:
             # one counts as enough of a sector: others near it have confirmed it
             points = np.concatenate([points, np.repeat(things, MIN_POINTS, 0)])
         return _Known(track.t_ns, world_from_body, points, sights, newest, things)
-
-    def _newest_sight(self, track: Track, update: MapUpdate) -> Seen | None:
-        """Points of the newest image whose track has come."""
-        sight = self._sight
-        grey = next((grey for seq, grey in list(self._greys) if seq == track.seq), None)
-        if grey is not None and track.seq != self._sighted:
-            self._sighted = track.seq
-            sight.add(track, grey, update)
-        return sight.newest

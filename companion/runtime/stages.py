@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from companion.flight_notes import GateStep, HealthNote, LinkReads
+from companion.flight_notes import GateStep, HealthNote, LinkReads, ObstaclePoints
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import Health
 from companion.messages import (
@@ -96,8 +96,9 @@ STAGES = (
     Stage(
         "recorder",
         (
-            Frame, *TELEMETRY, LinkReads, HealthNote, Warned, FrameTracked, GateStep, SiteMapUsed,
-            MapTakenUp, Odometry, OpticalFlow, LandingTarget, MapUpdate, PointChunk,
+            Frame, *TELEMETRY, LinkReads, HealthNote, Warned, FrameTracked, GateStep,
+            ObstaclePoints, SiteMapUsed, MapTakenUp, Odometry, OpticalFlow, LandingTarget,
+            MapUpdate, PointChunk,
         ),
         nice=5, frames=Frames.EVERY, answer_s=60.0, hurried_s=0.3, with_flight=True, in_folder=True,
     ),

@@ -25,7 +25,7 @@ from companion.estimation.gate.gate_journal import (
     POSE,
     SOURCES,
 )
-from companion.flight_notes import GateStep
+from companion.flight_notes import GateStep, ObstaclePoints
 from companion.geometry.transforms import Pose
 from companion.messages import (
     FrameTracked,
@@ -47,12 +47,14 @@ from drivers.recording.recording_topics import (
     EVENTS,
     GATES,
     MAP_TAKEN_UP,
+    OBSTACLE_POINTS,
     ODOMETRY,
     SENT,
     SITE_MAP,
     TRACKING,
     MapOfBefore,
     MavlinkBytes,
+    PointsOfKeyframe,
 )
 from drivers.recording.recording_topics import FLOW as FLOWS
 from drivers.recording.recording_topics import LANDING as LANDING_TARGETS
@@ -67,6 +69,7 @@ GATE_OF = {
     mavlink.MAVLINK_MSG_ID_OPTICAL_FLOW: FLOW,
     mavlink.MAVLINK_MSG_ID_OPTICAL_FLOW_RAD: FLOW,
     mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: OBSTACLES,
+    mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE_3D: OBSTACLES,
 }
 """Gate that let a message of ours through, by its id."""
 GATE_OF_COMMAND = {
@@ -95,6 +98,7 @@ class Decisions:
     """Landing targets by the number of the frame."""
     flows: dict[int, OpticalFlow] = field(default_factory=dict)
     """Optical flow by the number of the frame."""
+    obstacle_points: list[ObstaclePoints] = field(default_factory=list)
     site_map: SiteMapUsed | None = None
     map_taken_up: MapTakenUp | None = None
     """Map of a process before; None without one."""
@@ -124,6 +128,7 @@ def decisions_of(recording: Recording) -> Decisions:
     config = config_of_text(toml.decode(), where, lambda _: None)  # nobody renames its keys
     found = Decisions(config, name in LOSSLESS)
     stream = MavlinkStream()
+    sent: list[tuple[int, str, int, bytes]] = []
     take: dict[str, Callable[[int, bytes], None]] = {
         TRACKING: lambda t_ns, data: found.frames.append(_of(FrameTracked, t_ns, data)),
         GATES: lambda t_ns, data: found.gates.append(step_of(t_ns, data)),
@@ -143,6 +148,8 @@ def decisions_of(recording: Recording) -> Decisions:
             elif topic == FLOWS:
                 flow = _flow(message.t_ns, data)
                 found.flows[flow.seq] = flow
+            elif topic == OBSTACLE_POINTS:
+                found.obstacle_points.append(points_of(message.t_ns, data))
             elif topic == MAP_TAKEN_UP:
                 taken = MapOfBefore.FromString(data)
                 found.map_taken_up = MapTakenUp(
@@ -151,10 +158,13 @@ def decisions_of(recording: Recording) -> Decisions:
             elif topic == SITE_MAP:
                 found.site_map = _of(SiteMapUsed, message.t_ns, data)
             elif topic == SENT:
-                for gate, kind, payload in _gated(stream, data, found.config):
-                    found.sent[gate].append((kind, payload))
+                sent += [(message.t_ns, *each) for each in _gated(stream, data, found.config)]
             elif is_sample_topic(topic):
                 found.samples.append(sample_of(topic, message.t_ns, data))
+    begin_ns = min((step.t_ns for step in found.gates), default=0)
+    for t_ns, gate, kind, payload in sent:
+        if t_ns >= begin_ns:  # bytes of the link are recorded from before the flight on
+            found.sent[gate].append((kind, payload))
     if not found.frames:
         raise FlightError(
             f"{recording.path}: it does not say how its frames were tracked; recordings do since "
@@ -199,6 +209,13 @@ def _gated(stream: MavlinkStream, data: bytes, config: Config) -> Iterator[tuple
                 continue
         if gate is not None:
             yield gate, packet.message_id, payload
+
+
+def points_of(t_ns: int, data: bytes) -> ObstaclePoints:
+    """Recorded points in which obstacles are looked for."""
+    given = PointsOfKeyframe.FromString(data)
+    points = np.frombuffer(given.points, "<f4").reshape(-1, 3)
+    return ObstaclePoints(t_ns, given.keyframe_id, points)
 
 
 def _target(t_ns: int, data: bytes) -> LandingTarget:

@@ -18,7 +18,7 @@ from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 
-from companion.flight_notes import GateStep, LinkBytes
+from companion.flight_notes import GateStep, LinkBytes, ObstaclePoints
 from companion.geometry.transforms import Similarity, quaternion_from_rotation
 from companion.messages import (
     FrameTracked,
@@ -32,7 +32,12 @@ from companion.messages import (
 )
 from companion.telemetry import FIELDS, TELEMETRY, Telemetry
 from companion.telemetry_schema import Field
-from drivers.recording.recording_topics import MapOfBefore, MavlinkBytes, telemetry_topic
+from drivers.recording.recording_topics import (
+    MapOfBefore,
+    MavlinkBytes,
+    PointsOfKeyframe,
+    telemetry_topic,
+)
 
 WORLD, MAP = "local_ned", "map"
 """Coordinate frames for Foxglove."""
@@ -82,6 +87,12 @@ def link_bytes(taken: LinkBytes) -> bytes:
         monotonic_ns=taken.monotonic_ns, epoch_ns=taken.t_ns, data=taken.data
     )  # fmt: skip
     return serialised(message)
+
+
+def obstacle_points_bytes(part: ObstaclePoints) -> bytes:
+    """Points in which obstacles are looked for, without their time."""
+    points = part.points_camera.astype("<f4").tobytes()
+    return serialised(PointsOfKeyframe(keyframe_id=part.keyframe_id, points=points))
 
 
 def map_of_before_bytes(taken: MapTakenUp) -> bytes:

@@ -12,7 +12,7 @@ from companion.config import Config
 from companion.config.passwords import with_passwords_hidden
 from companion.config_file import to_toml
 from companion.errors import StageError
-from companion.flight_notes import FlightNote, GateStep, HealthNote, LinkBytes
+from companion.flight_notes import FlightNote, GateStep, HealthNote, LinkBytes, ObstaclePoints
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Similarity
 from companion.messages import (
@@ -43,6 +43,7 @@ from drivers.recording.recorded_content import (
     json_bytes,
     link_bytes,
     map_of_before_bytes,
+    obstacle_points_bytes,
     odometry_bytes,
     pose_bytes,
     sample_bytes,
@@ -57,6 +58,7 @@ from drivers.recording.recording_topics import (
     HEALTH,
     LANDING,
     MAP_TAKEN_UP,
+    OBSTACLE_POINTS,
     ODOMETRY,
     POSE,
     PROFILE,
@@ -146,6 +148,8 @@ class Recorder:
             self._put(topic, message.t_ns, decision_bytes(message), message.seq)
         elif isinstance(message, MapTakenUp):
             self._put(MAP_TAKEN_UP, message.t_ns, map_of_before_bytes(message))
+        elif isinstance(message, ObstaclePoints):
+            self._put(OBSTACLE_POINTS, message.t_ns, obstacle_points_bytes(message))
         elif isinstance(message, Warned):
             self._put(EVENTS, message.t_ns, event_bytes(message))
         elif isinstance(message, HealthNote):

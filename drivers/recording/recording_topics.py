@@ -36,11 +36,23 @@ EVENTS, HEALTH = "/events", "/health"
 TRACKING, GATES = "/decisions/tracking", "/decisions/gates"
 SITE_MAP = "/decisions/site_map"
 LANDING, FLOW = "/landing_target", "/optical_flow"
-MAP_TAKEN_UP = "/decisions/map_taken_up"
+MAP_TAKEN_UP, OBSTACLE_POINTS = "/decisions/map_taken_up", "/decisions/obstacle_points"
 PICTURES = frozenset({IMAGE, VIDEO, RAW})
 """Topics of images, of which a flight has one."""
 FROM_PICTURES = frozenset(
-    {GREY, POSE, ODOMETRY, CLOUD, TRACKING, GATES, SITE_MAP, LANDING, FLOW, MAP_TAKEN_UP}
+    {
+        GREY,
+        POSE,
+        ODOMETRY,
+        CLOUD,
+        TRACKING,
+        GATES,
+        SITE_MAP,
+        LANDING,
+        FLOW,
+        MAP_TAKEN_UP,
+        OBSTACLE_POINTS,
+    }
 )
 """Topics of what was made of images."""
 
@@ -80,6 +92,10 @@ MavlinkBytes: Any = _own_message(
 MapOfBefore: Any = _own_message(
     "MapTakenUp", {"absent_ns": _FIELD.TYPE_FIXED64, "data": _FIELD.TYPE_BYTES}
 )
+PointsOfKeyframe: Any = _own_message(
+    "ObstaclePoints", {"keyframe_id": _FIELD.TYPE_FIXED64, "points": _FIELD.TYPE_BYTES}
+)
+"""`points` are x, y, z of each, float32, little-endian."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +197,7 @@ TOPICS: dict[str, Any] = {
         },
     ),
     MAP_TAKEN_UP: MapOfBefore,
+    OBSTACLE_POINTS: PointsOfKeyframe,
     CLOUD: PointCloud,
     EVENTS: Log,
     HEALTH: _Json(

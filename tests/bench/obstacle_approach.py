@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from companion.config_file import load_config
-from companion.daemon.vehicle_reports import VehicleReports
+from companion.daemon.obstacle_reports import ObstacleReports
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, yaw_rotation
 from companion.messages import DepthMap, Frame, MapUpdate, Message, PointChunk, Track
@@ -113,10 +113,9 @@ class Approach:
         self._scene, self._place = scene(thing, thick_m, seed), path_of(seed)
         self._clock = SetClock()
         self._clock.t_ns = START_NS
-        watch: Any = None
         config = load_config(None, ["feedback.obstacle_distance=true"])
         self._link = memory_link(MemoryPort(), self._clock, lambda _: None)
-        self._reports = VehicleReports(self._link, self._clock, watch, config)
+        self._reports = ObstacleReports(config.feedback, self._link, self._clock, lambda note: None)
         self._reports.restart(CAMERA)
         self._asked_ns = 0
         self.told: list[tuple[float, float, bool]] = []
@@ -153,7 +152,8 @@ class Approach:
         firmwares: tuple[Firmware, ...] = ("ardupilot", "px4")
         for firmware in firmwares:
             self._link.vehicle = Vehicle(1, firmware, True, "")
-            messages = self._reports._obstacle_messages()
+            look = self._reports.look()
+            messages = self._reports.tell(look, *look.found())
             if not messages:
                 return
             (told[firmware],) = messages

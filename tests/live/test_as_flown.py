@@ -52,7 +52,7 @@ def flown(folder: Path) -> Path:
     with Flying(
         folder, "recorder.codec=png", f"telemetry.use={list(use)}", "gps.switch_source=true",
         "landing.marker=apriltag_36h11", "landing.id=0", f"landing.size_m={MARKERS_M}",
-        "feedback.flow=optical_flow",
+        "feedback.flow=optical_flow", "feedback.obstacle_distance=true",
         has_imu=True,
     ) as flying:  # fmt: skip
         flying.camera.markers_m = MARKERS_M
@@ -113,6 +113,7 @@ def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> No
     assert found["targets_same"] == found["targets"] > 100
     sent = {gate: each["sent"] for gate, each in found["by_gate"].items()}
     assert sent["pose"] > 100 and sent["landing"] >= 20 and sent["sources"] >= 2
+    assert sent["obstacles"] > 100 and any(step.values.get("has_image") for step in told.gates)
     assert sent["flow"] > 100 and any(flow.quality for flow in told.flows.values())
     assert "the same to the byte" in done.stdout
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from companion.app.progress import Progress
+from companion.app.replay.obstacles_again import ObstaclesAgain
 from companion.app.replay.sent_again import SentAgain, steps_as_tracked
 from companion.config import Config
 from companion.errors import FlightError, StageError
@@ -75,11 +76,14 @@ def replay_as_flown(
                 "optical flow go to the gates"
             )
         made = SentAgain(told, tracked.odometry, tracked.targets, tracked.flows).payloads(steps)
+        if tracked.obstacles is not None:
+            made[OBSTACLES] = tracked.obstacles.payloads
     finally:
         flight.recording.close()
     by_gate = {
         gate: _compared(made.get(gate, []), told.sent.get(gate, []))
         for gate in sorted({*made, *told.sent} & {step.gate for step in told.gates})
+        if told.lossless or gate != OBSTACLES
     }
     not_made = {gate: len(sent) for gate, sent in told.sent.items() if gate not in by_gate}
     n_tracked = sum(_same(tracked.odometry.get(n), each) for n, each in told.odometry.items())
@@ -108,8 +112,8 @@ def replay_as_flown(
             )
     for gate, n in not_made.items():
         why = (
-            "they hang on the dense map, whose depth is not computed again"
-            if gate == OBSTACLES
+            "they are found in images, which were compressed with losses"
+            if gate == OBSTACLES and not told.lossless
             else "the recording is of a version that kept no journal of them"
         )
         notify(f"{n} messages of `{gate}` were sent and are not made again: {why}")
@@ -130,9 +134,13 @@ class Tracked:
     """Of each update of the map its place, see `placed_values`."""
     verdicts: list[bool] = field(default_factory=list)
     """True where satellites begin to be doubted, False where that ends."""
+    obstacles: ObstaclesAgain | None = None
+    """None where they are not looked for again."""
 
     def take(self, message: Message) -> None:
         """Take an output of localisation."""
+        if self.obstacles is not None:
+            self.obstacles.take(message)
         if isinstance(message, Odometry):
             self.odometry[message.seq] = message
         elif isinstance(message, OpticalFlow):
@@ -175,7 +183,7 @@ def _tracked_again(
         order=[step.mapping_point for step in told.frames], site=site,
     )  # fmt: skip
     _take_up(stage, told, camera)
-    found = Tracked()
+    found = Tracked(obstacles=ObstaclesAgain(told, camera))
     pictures = _looked_at(frames, camera, told, found)
     n_taken = 0
     try:
@@ -231,6 +239,8 @@ def _looked_at(
     detector = MarkerDetector(told.config.landing, camera) if told.targets else None
     for frame in frames:
         if isinstance(frame, Frame):
+            if found.obstacles is not None:
+                found.obstacles.frame(frame)
             if detector is not None and frame.seq in told.targets:
                 found.targets[frame.seq] = detector.step(frame)
             yield frame

@@ -68,6 +68,7 @@ class SentAgain:
     def payloads(self, steps: Sequence[GateStep]) -> Payloads:
         """Id and payload of each message, by its gate."""
         found: Payloads = defaultdict(list)
+        steps = [step for step in steps if step.gate in self._gates]  # without obstacles
         for step, given in given_again(self._gates, steps, self._told.samples):
             if step.sent:
                 found[step.gate] += payloads_of(self._messages(step, given))

@@ -17,7 +17,7 @@ from companion.telemetry import Telemetry
 POSE, LANDING, GLOBAL, SOURCES, FLOW = "pose", "landing", "global", "sources", "flow"
 """Gates: poses, landing targets, global positions, source sets of the EKF, optical flow."""
 OBSTACLES = "obstacles"
-"""Without a journal: OBSTACLE_DISTANCE hangs on the dense map, which is not computed again."""
+"""Rounds of obstacles: see `companion.daemon.obstacle_reports`."""
 BEGIN = "begin"
 Takes = Mapping[type, Callable[[Any], None]]
 """Methods that take samples, by the kinds of those that count."""

@@ -8,10 +8,18 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.geometry.transforms import Array
-from companion.obstacles.obstacle_sectors import MAX_M, MIN_M, SECTOR_DEG, Obstacles
+from companion.obstacles.obstacle_sectors import MAX_M, MIN_M, SECTOR_DEG, Obstacles, unknown
 
 NO_ID = 65535
 """Obstacles are not followed from one round to the next."""
+
+
+def obstacle_messages(found: Obstacles | Array | None, t_ns: int, in_space: bool) -> list[Any]:
+    """Messages of a round: of obstacles per sector, or points (N, 3), body axes; None: unknown."""
+    if in_space:
+        points = found if isinstance(found, np.ndarray) else np.zeros((0, 3))
+        return obstacles_3d(points, t_ns)
+    return [obstacle_distance(found if isinstance(found, Obstacles) else unknown(t_ns))]
 
 
 def obstacle_distance(obstacles: Obstacles) -> Any:

@@ -18,7 +18,7 @@ from companion.geometry.transforms import (
 )
 from companion.messages import Georeference, MapUpdate, PointChunk
 from companion.obstacles.obstacle_sectors import N_SECTORS, UNKNOWN_CM, obstacles_around
-from companion.obstacles.recent_cloud import RecentCloud
+from companion.obstacles.recent_cloud import RecentCloud, obstacle_points
 from drivers.mavlink.measurements.obstacle_distance import obstacle_distance
 
 PLACE = np.array([103.0, -57.0, -12.0])
@@ -161,8 +161,8 @@ def test_recent_cloud_follows_map_updates() -> None:
     update = map_update(Similarity(4.0, turn, PLACE))
     cloud = RecentCloud(max_age_s=10)
     points = np.array([[0.5, 0.25, 2.0], [1.0, 0.0, 3.0]])
-    cloud.add(chunk(5, 100, points))
-    cloud.add(chunk(6, 100, points))  # of a keyframe that the map does not have
+    cloud.add(obstacle_points(chunk(5, 100, points)))
+    cloud.add(obstacle_points(chunk(6, 100, points)))  # of a keyframe that the map does not have
     placed = cloud.in_world(105 * 10**9, update)
     assert placed is not None
     camera = update.map_from_camera[5]
@@ -175,19 +175,19 @@ def test_recent_cloud_follows_map_updates() -> None:
 
 def test_without_a_scale_there_are_no_distances() -> None:
     cloud = RecentCloud()
-    cloud.add(chunk(5, 100, np.ones((5, 3))))
+    cloud.add(obstacle_points(chunk(5, 100, np.ones((5, 3)))))
     assert cloud.in_world(100 * 10**9, map_update(None)) is None
 
 
 def test_recent_cloud_is_bounded() -> None:
-    cloud = RecentCloud(max_chunks=3, max_points=100)
+    cloud = RecentCloud(max_parts=3)
     update = MapUpdate(
         1, 0, {i: Pose.identity() for i in range(10)}, np.zeros((0, 3)),
         Georeference(Similarity.identity(), 0.01, 0.01, "", 9, 0.1),
     )  # fmt: skip
     for i in range(10):
-        cloud.add(chunk(i, 100 + i, np.full((950, 3), float(i))))
-        cloud.add(chunk(i, 100 + i, np.full((1050, 3), float(i))))
+        cloud.add(obstacle_points(chunk(i, 100 + i, np.full((950, 3), float(i))), 100))
+        cloud.add(obstacle_points(chunk(i, 100 + i, np.full((1050, 3), float(i))), 100))
     placed = cloud.in_world(110 * 10**9, update)
     assert placed is not None
     assert sorted(set(placed[:, 0])) == [7, 8, 9]

@@ -1,4 +1,4 @@
-"""OBSTACLE_DISTANCE before a wall and a pole of known depth, on a link without a wire."""
+"""Obstacles told before a wall and a pole of known depth, on a link without a wire."""
 
 from __future__ import annotations
 
@@ -6,16 +6,20 @@ import asyncio
 import sys
 import threading
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
+from companion.app.replay.obstacles_again import ObstaclesAgain
 from companion.config import Config, FeedbackConfig
-from companion.daemon.vehicle_reports import UNKNOWN_AFTER_NS, VehicleReports
+from companion.daemon.obstacle_reports import UNKNOWN_AFTER_NS, ObstacleReports
+from companion.flight_notes import GateStep, ObstaclePoints
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import (
+    Bytes,
     DepthMap,
     Floats,
     Frame,
@@ -26,10 +30,14 @@ from companion.messages import (
     Track,
     TrackState,
 )
-from companion.obstacles.obstacle_finder import MAX_AGE_NS
+from companion.obstacles.obstacle_finder import MAX_AGE_NS, MOST_TRACKS
 from companion.obstacles.obstacle_sectors import FREE_M
 from companion.obstacles.recent_cloud import STAYS_S
+from companion.timing.clock import FlightClock
+from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.vehicle import Firmware, Vehicle
+from drivers.recording.decisions import Decisions, payloads_of, points_of, step_of
+from drivers.recording.recorded_content import decision_bytes, obstacle_points_bytes
 from tests.support.autopilot.memory_link import SetClock, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
 from tests.unit.obstacles.test_newest_sight import SCENE
@@ -59,6 +67,49 @@ def depth_of(position_m: Array, wall_north_m: float, pole: Pole) -> Array:
     return np.where(hit & (ahead > 0.2), np.minimum(ahead, depth), depth)
 
 
+class Heard(ObstacleReports):
+    """Reports that keep what comes, what is recorded, and what is sent."""
+
+    def __init__(self, config: FeedbackConfig, link: AutopilotLink, clock: FlightClock) -> None:
+        self.came: list[Any] = []
+        self.steps: list[GateStep] = []
+        self.points: list[ObstaclePoints] = []
+        self.sent: list[Any] = []
+        super().__init__(config, link, clock, self._keep)
+
+    def _keep(self, note: GateStep | ObstaclePoints) -> None:
+        if isinstance(note, GateStep):
+            self.steps.append(step_of(note.t_ns, decision_bytes(note)))
+        else:
+            self.points.append(points_of(note.t_ns, obstacle_points_bytes(note)))
+
+    def take(self, message: Any) -> None:
+        self.came.append(message)
+        super().take(message)
+
+    def frame(self, frame: Frame) -> None:
+        self.came.append(frame)
+        super().frame(frame)
+
+    def told(self) -> list[Any]:
+        """Messages of one round."""
+        look = self.look()
+        messages = self.tell(look, *look.found())
+        self.sent += messages
+        return messages
+
+    def sent_again(self, camera: Camera) -> list[tuple[int, bytes]]:
+        """Made again by what is recorded, of the same images and output of localisation."""
+        told = Decisions(Config(), True, gates=self.steps, obstacle_points=self.points)
+        again = ObstaclesAgain(told, camera)
+        for message in self.came:
+            if isinstance(message, Frame):
+                again.frame(message)
+            else:
+                again.take(message)
+        return again.payloads
+
+
 class Approach:
     """North at 2 m/s towards a wall and a pole; a keyframe each 0.5 s, its depth 0.6 s later."""
 
@@ -67,10 +118,7 @@ class Approach:
         self.clock, self.port = SetClock(), MemoryPort()
         self.began_ns = self.clock.t_ns
         self.link = memory_link(self.port, self.clock, lambda _: None)
-        watch: Any = None
-        self.reports = VehicleReports(
-            self.link, self.clock, watch, Config(feedback=FeedbackConfig(obstacle_distance=True))
-        )
+        self.reports = Heard(FeedbackConfig(obstacle_distance=True), self.link, self.clock)
         self.reports.restart(CAMERA)
         self.keyframes: dict[int, Pose] = {}
         self.update: MapUpdate | None = None
@@ -120,7 +168,7 @@ class Approach:
         self.late.append((t_ns + round(0.6 * S), made))
 
     def now(self) -> list[int]:
-        messages: Any = self.reports._obstacle_messages()
+        messages = self.reports.told()
         return list(messages[0].distances) if messages else []
 
 
@@ -194,29 +242,34 @@ def test_points_of_the_map_in_the_newest_frame_are_obstacles() -> None:
     assert min(found[0], found[71]) == pytest.approx(100 * (8.0 - approach.position[0]), abs=30)
 
 
+@cache
+def picture(n: int) -> tuple[Pose, Bytes]:
+    """Pose in the map and grey image of frame `n`: past a pole of 0.3 m, 6 m ahead."""
+    pose = Pose(np.eye(3), np.array([0.0, 0.08 * n - 0.88, -3.0])) @ FORWARD
+    return pose, SCENE.picture(EYE, pose)
+
+
 def looked(
     firmware: Firmware, n_images: int = 12, in_space: bool = False
-) -> tuple[list[Any], VehicleReports]:
+) -> tuple[list[Any], Heard]:
     """Told by images and poses alone, past a pole of 0.3 m, 6 m ahead, before a far wall."""
     clock: Any = SetClock()
     link = memory_link(MemoryPort(), clock, lambda _: None)
     link.vehicle = Vehicle(1, firmware, True, "")
-    watch: Any = None
-    config = Config(feedback=FeedbackConfig(obstacle_distance=True, obstacles_3d=in_space))
-    reports = VehicleReports(link, clock, watch, config)
+    config = FeedbackConfig(obstacle_distance=True, obstacles_3d=in_space)
+    reports = Heard(config, link, clock)
     reports.restart(EYE)
     keyframe = Pose(np.eye(3), np.array([0.0, 0.0, -3.0])) @ FORWARD
     world = Georeference(Similarity.identity(), 0.01, 0.01, "", 9, 0.1)
     reports.take(MapUpdate(1, clock.t_ns, {7: keyframe}, np.zeros((0, 3)), world))
     messages: list[Any] = []
     for n in range(n_images):
-        pose = Pose(np.eye(3), np.array([0.0, 0.08 * n - 0.88, -3.0])) @ FORWARD
-        grey = SCENE.picture(EYE, pose)
+        pose, grey = picture(n)
         reports.frame(Frame(n, clock.t_ns, grey, np.repeat(grey[..., None], 3, 2)))
         relative = keyframe.inverse() @ pose
         reports.take(Track(n, clock.t_ns, TrackState.TRACKING, pose, 7, relative))
         clock.t_ns += S // 10
-        messages = reports._obstacle_messages()
+        messages = reports.told()
     return messages, reports
 
 
@@ -224,23 +277,22 @@ def test_images_alone_tell_of_a_pole_and_of_free_space() -> None:
     """To PX4 what is free is told, up to where it is; to ArduPilot, which does not ask, what stands
     farther away."""
     (message,), _ = looked("px4")
-    told = list(message.distances)
-    assert min(told[1], told[2]) == pytest.approx(100 * np.hypot(6.0, 0.8), abs=60)
-    assert told[70] == told[71] == round(100 * FREE_M) + 1
-    assert set(told[5:68]) == {UNKNOWN}
+    distances = list(message.distances)
+    assert min(distances[1], distances[2]) == pytest.approx(100 * np.hypot(6.0, 0.8), abs=60)
+    assert distances[70] == distances[71] == round(100 * FREE_M) + 1
+    assert set(distances[5:68]) == {UNKNOWN}
     (message,), reports = looked("ardupilot")
-    told = list(message.distances)
-    assert min(told[1], told[2]) == pytest.approx(100 * np.hypot(6.0, 0.8), abs=60)
-    assert told[70] == told[71] == UNKNOWN
+    distances = list(message.distances)
+    assert min(distances[1], distances[2]) == pytest.approx(100 * np.hypot(6.0, 0.8), abs=60)
+    assert distances[70] == distances[71] == UNKNOWN
     reports._clock.t_ns += MAX_AGE_NS  # type: ignore[attr-defined]
-    (message,) = reports._obstacle_messages()
-    assert set(message.distances) == {UNKNOWN}  # type: ignore[attr-defined]
+    (message,) = reports.told()
+    assert set(message.distances) == {UNKNOWN}
 
 
 def test_in_space_ardupilot_is_told_where_the_pole_stands() -> None:
     """In body axes; PX4, which does not take such messages, is told distances."""
-    told, reports = looked("ardupilot", in_space=True)
-    *things, last = told
+    (*things, last), reports = looked("ardupilot", in_space=True)
     assert things
     for each in things:
         assert each.get_type() == "OBSTACLE_DISTANCE_3D"
@@ -250,7 +302,7 @@ def test_in_space_ardupilot_is_told_where_the_pole_stands() -> None:
     assert (last.x, last.y, last.z) == (0.0, 0.0, 0.0)
     assert {each.time_boot_ms for each in things} == {last.time_boot_ms - 1}
     reports._clock.t_ns += MAX_AGE_NS  # type: ignore[attr-defined]
-    assert len(reports._obstacle_messages()) == 1
+    assert len(reports.told()) == 1
     (message,), _ = looked("px4", in_space=True)
     assert message.get_type() == "OBSTACLE_DISTANCE"
 
@@ -279,12 +331,43 @@ def test_how_thin_a_pole_is_found(radius_m: float) -> None:
     assert found[0] == pytest.approx(500, abs=55)
 
 
+def test_rounds_are_made_again_by_their_notes() -> None:
+    """Of depths, of images alone, for each firmware; and of an image that was gone by then."""
+    approach = Approach()
+    for _ in range(12):
+        approach.fly(0.25)
+    approach.fly(1e-9 * UNKNOWN_AFTER_NS + 1.0, tracked=False)
+    assert len(approach.reports.points) > 3 and not approach.reports.steps[-1].sent
+    assert approach.reports.sent_again(CAMERA) == payloads_of(approach.reports.sent)
+    firmwares: tuple[tuple[Firmware, bool], ...] = (
+        ("px4", False), ("ardupilot", False), ("ardupilot", True),
+    )  # fmt: skip
+    for firmware, in_space in firmwares:
+        _, reports = looked(firmware, in_space=in_space)
+        blank = next(message for message in reports.came if isinstance(message, Frame))
+        for n in range(100, 100 + MOST_TRACKS):
+            reports.frame(replace(blank, seq=n))
+        reports.take(replace(reports.came[-MOST_TRACKS - 1], seq=blank.seq))
+        reports.told()
+        assert not reports.steps[-1].values["has_image"]
+        assert reports.sent_again(EYE) == payloads_of(reports.sent)
+
+
+def test_nothing_is_told_of_the_flight_before() -> None:
+    approach = Approach()
+    approach.fly(2.0)
+    look = approach.reports.look()
+    n_steps = len(approach.reports.steps)
+    approach.reports.restart(CAMERA)
+    assert approach.reports.tell(look, *look.found()) == []
+    assert len(approach.reports.steps) == n_steps
+
+
 def test_it_goes_out_ten_times_a_second() -> None:
     async def fly() -> int:
         approach = Approach()
         approach.fly(2.0)
         approach.link.alive = True
-        approach.reports.computer_hz = 0.0
         task = asyncio.create_task(approach.reports.run())
         while len(approach.port.of("OBSTACLE_DISTANCE")) < 3:
             await asyncio.sleep(0.01)
