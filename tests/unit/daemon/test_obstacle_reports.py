@@ -344,12 +344,16 @@ def test_rounds_are_made_again_by_their_notes() -> None:
     )  # fmt: skip
     for firmware, in_space in firmwares:
         _, reports = looked(firmware, in_space=in_space)
-        blank = next(message for message in reports.came if isinstance(message, Frame))
+        *_, frame, track = reports.came
+        reports.frame(replace(frame, seq=99, grey=255 - frame.grey))
+        reports.take(replace(track, seq=99))
         for n in range(100, 100 + MOST_TRACKS):
-            reports.frame(replace(blank, seq=n))
-        reports.take(replace(reports.came[-MOST_TRACKS - 1], seq=blank.seq))
+            reports.frame(replace(frame, seq=n))
         reports.told()
         assert not reports.steps[-1].values["has_image"]
+        reports.take(replace(track, seq=n))
+        reports.told()
+        assert reports.steps[-1].values["has_image"]
         assert reports.sent_again(EYE) == payloads_of(reports.sent)
 
 
