@@ -20,7 +20,6 @@ class Sender:
 
     def begin_flight(self, use: Collection[Measurement]) -> None:
         """A flight has begun, and its recording; of telemetry it believes what is in `use`."""
-        raise NotImplementedError
 
     def reconfigure(self, config: FeedbackConfig) -> None:
         """Apply other limits and messages from the next frame on."""

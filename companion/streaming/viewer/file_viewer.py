@@ -9,13 +9,13 @@ from pathlib import Path
 from companion.config import ViewerConfig
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
+from companion.runtime.mailbox import DropPolicy, Mailbox
 from companion.runtime.message_size import size_bytes
 from companion.streaming.frame_jpeg import picture_of
 from companion.streaming.items import FlightItem, ImageItem, Item
 from companion.streaming.scene_encoder import SceneEncoder, Watched
 from companion.streaming.viewer.colours import Colours
 from companion.streaming.viewer.drawing import Drawing
-from companion.streaming.viewer.inbox import Inbox
 from companion.streaming.viewer.rrd_files import RrdFiles
 
 CAPACITY_BYTES = 64 << 20
@@ -37,20 +37,22 @@ class FileViewer:
         self._files = RrdFiles(path, config.rrd_mb << 20, indexed)
         self._config = config
         self._encoder = SceneEncoder(FlightItem(path.parent.name, path.parent.name, camera, origin))
-        self._inbox = Inbox(CAPACITY_BYTES)
+        self._waiting: Mailbox[Watched] = Mailbox(
+            lambda _: DropPolicy.LOSSLESS, size_bytes, CAPACITY_BYTES, waits=True
+        )
         self._fault: BaseException | None = None
         self._thread = threading.Thread(target=self._work, name="recording", daemon=True)
 
     def take(self, message: Watched) -> None:
         """Queue one message."""
-        self._inbox.put(message)
+        self._waiting.put(message)
 
     def __enter__(self) -> FileViewer:
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._inbox.close()
+        self._waiting.close()
         self._thread.join()
         try:
             self._files.close()
@@ -64,12 +66,12 @@ class FileViewer:
             colours = Colours(self._config.colours)
             drawing = Drawing(self._files.recording, live=False, colours=colours)
             drawing.draw(self._encoder.flight)
-            while (message := self._inbox.get()) is not None:
+            while (message := self._waiting.get()) is not None:
                 self._draw(drawing, self._encoder.take(message))
             self._draw(drawing, self._encoder.close())
         except BaseException as fault:
             self._fault = fault
-            self._inbox.close()
+            self._waiting.close()
 
     def _draw(self, drawing: Drawing, items: list[Item]) -> None:
         for item in items:

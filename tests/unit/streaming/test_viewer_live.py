@@ -23,7 +23,6 @@ from companion.streaming.ground_link import GroundLink
 from companion.streaming.items import Item, PictureItem, PointsItem, PoseItem, StatusItem
 from companion.streaming.live_viewer import LiveViewer
 from companion.streaming.onboard_viewer import GROUND
-from companion.streaming.viewer.inbox import Inbox
 from companion.streaming.viewer.screen import DISPLAYS, GRPC_PORT, WEB_PORT, listens
 from tests.support.flights import flown
 from tests.support.waiting import until
@@ -208,23 +207,3 @@ def test_view_without_a_display_says_so(display: dict[str, str]) -> None:
     )  # fmt: skip
     assert run.returncode == 2
     assert "a window wants one" in run.stderr and "Traceback" not in run.stderr
-
-
-def test_inbox_blocks_until_there_is_capacity_or_it_is_closed() -> None:
-    inbox = Inbox(10)
-    inbox.put(image(0))
-    waiting = threading.Thread(target=inbox.put, args=(image(1),))
-    waiting.start()
-    waiting.join(0.2)
-    assert waiting.is_alive()
-    inbox.get()
-    waiting.join(60)
-    assert not waiting.is_alive()
-    second = threading.Thread(target=inbox.put, args=(image(2),))
-    second.start()
-    inbox.close()
-    second.join(60)
-    assert not second.is_alive()
-    first = inbox.get()
-    assert isinstance(first, Frame) and first.seq == 1
-    assert inbox.get() is None
