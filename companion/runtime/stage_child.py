@@ -29,6 +29,7 @@ from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
 from companion.messages import Frame  # noqa: E402
+from companion.runtime.collection_pause import garbage_collection_paused  # noqa: E402
 from companion.runtime.mailbox import Mailbox  # noqa: E402
 from companion.runtime.parcel import Parcel  # noqa: E402
 from companion.runtime.peak_memory import peak_memory_mb  # noqa: E402
@@ -48,7 +49,6 @@ from companion.runtime.stages import (  # noqa: E402
     lossless,
     stage_named,
 )
-from companion.runtime.uncollected import uncollected  # noqa: E402
 from companion.timing.clock import monotonic_s, wait_s  # noqa: E402
 
 IN_BYTES = 64 << 20
@@ -98,7 +98,7 @@ def run(name: str, descriptor: int) -> int:
 
 def imported(name: str) -> WorkModule:
     """Module of a stage, with all that it needs."""
-    with uncollected():
+    with garbage_collection_paused():
         module = module_of(name)
     gc.enable()  # which the fork server has not
     return module

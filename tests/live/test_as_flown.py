@@ -151,15 +151,19 @@ def test_a_flight_in_the_map_of_an_earlier_one_is_flown_again_in_that_map(tmp_pa
 
 
 def test_compressed_images_give_the_decisions_of_the_gates_again(tmp_path: Path) -> None:
-    with Flying(tmp_path, "recorder.codec=mjpeg", "feedback.flow=optical_flow_rad") as flying:
+    with Flying(
+        tmp_path, "recorder.codec=mjpeg", "feedback.flow=optical_flow_rad",
+        "feedback.obstacle_distance=true",
+    ) as flying:  # fmt: skip
         flying.take_off()
         flying.autopilot.wait_for("ODOMETRY", ENOUGH, 120)
         flying.autopilot.disarm()
         flying.daemon.line("results so far")
         (path,) = flying.daemon.flown()
         flying.daemon.stop()
-    _, found = again(path, tmp_path / "again")
+    done, found = again(path, tmp_path / "again")
     assert not found["tracked_again"]
+    assert found["not_made_again"]["obstacles"] > 20 and "compressed with losses" in done.stdout
     assert found["by_gate"]["pose"]["sent"] > 100 and found["by_gate"]["flow"]["sent"] > 100
 
 

@@ -13,7 +13,7 @@ from companion.app.stopping import StopSignals
 from companion.config import Config
 from companion.config_file import load_config, to_toml
 from companion.errors import InputError
-from companion.runtime.uncollected import uncollected
+from companion.runtime.collection_pause import garbage_collection_paused
 
 
 def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -34,13 +34,13 @@ def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
         signals.defer()
         return run_depth_node(config, lambda: signals.received is not None)
-    with uncollected():
+    with garbage_collection_paused():
         import companion.daemon.shared_imports  # noqa: F401
     from companion.runtime.fork_server import ForkServer
 
     with ForkServer(copy=True) as server:  # before there are threads and what only the daemon needs
         server.prepare("localisation")  # whose imports take longest, while the daemon makes its own
-        with uncollected():
+        with garbage_collection_paused():
             from companion.daemon.daemon import run
             from companion.daemon.page_child import SettingsSource
 

@@ -25,7 +25,7 @@ from companion.app.stopping import StopSignals
 from companion.config import Config, MapConfig
 from companion.config_file import load_config
 from companion.errors import InputError
-from companion.runtime.uncollected import uncollected
+from companion.runtime.collection_pause import garbage_collection_paused
 
 
 def _with_telemetry(arguments: argparse.Namespace) -> Config:
@@ -68,7 +68,7 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
             replay_as_flown(arguments.flight, arguments.out, config, progress, print)
         signals.take()
         return 0
-    with uncollected():
+    with garbage_collection_paused():
         from companion.app.replay.replay_command import RecordedInput, replay
         from companion.telemetry import belief_in_words
 

@@ -1,4 +1,4 @@
-"""Making what stays, as imports do, without looking for garbage among it time and again."""
+"""Pause of the garbage collection while objects that stay are made, as by imports."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def uncollected() -> Iterator[None]:
-    """Collect no garbage meanwhile; what there is at the end is never looked through again."""
+def garbage_collection_paused() -> Iterator[None]:
+    """Collect no garbage meanwhile; objects that there are at the end are exempt from then on."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
