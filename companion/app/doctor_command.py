@@ -7,22 +7,27 @@ sets them, after confirmation, reads each back, examines again, and has them sto
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import json
 import sys
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, TextIO
 
 from companion.advice.imu_room import BITS_PER_BYTE, LOOP_RATE, check_loop_rate, imu_room
 from companion.advice.line_rate import check_line, line_parameters
 from companion.advice.pose_parameters import advise, names_to_read
 from companion.advice.wanted import ARDUPILOT, FIRMWARES, Finding
+from companion.app.doctor_findings import (
+    Examination,
+    counted,
+    document,
+    print_findings,
+    print_outcome,
+)
 from companion.config import Config, LinkConfig
 from companion.errors import ConfigError, InputError, SourceError
 from drivers.mavlink.asking_link import asking_link
 from drivers.mavlink.parameters import Parameters
-from drivers.mavlink.vehicle import Vehicle
 from drivers.mavlink.wire.link_url import LOOPBACK, client_endpoint, link_endpoint
 from drivers.system.login_console import login_console_on
 from drivers.system.status_socket import ask_status, found_socket_path
@@ -35,34 +40,6 @@ ANY_ADDRESS = ("0.0.0.0", "::")
 GOOD, IN_THE_WAY = 0, 1
 
 Ask = Callable[[str], bool]
-
-
-@dataclass(slots=True)
-class Examination:
-    """Findings, and the parameters written."""
-
-    vehicle: Vehicle
-    where: str
-    mode: str
-    findings: list[Finding]
-    n_examined: int
-    comes: str = ""
-    """Note on what the daemon hears of the autopilot; without one, the IMU it will ask for."""
-    written: list[dict[str, Any]] = field(default_factory=list)
-    refused: list[str] = field(default_factory=list)
-    """Parameters that the autopilot refused, in words."""
-    not_stored: str = ""
-    """Reason for which those written may be lost with the power; "" where they are not."""
-
-    @property
-    def blocking(self) -> list[Finding]:
-        """Findings that prevent use of the pose."""
-        return [finding for finding in self.findings if finding.blocking]
-
-    @property
-    def reboot_for(self) -> list[str]:
-        """Parameters written that take effect after a reboot."""
-        return [each["name"] for each in self.written if each["reboot"]]
 
 
 def doctor(
@@ -97,12 +74,12 @@ def doctor(
     daemon = _running_daemon(config)
     link = replace(config.link, url=_url_to_ask_at(config, daemon))
     decide: Ask = (lambda question: True) if yes else ask
-    show = None if as_json else lambda examination: _print_findings(examination, config, out)
+    show = None if as_json else lambda examination: print_findings(examination, config, out)
     found = asyncio.run(_examine(config, link, daemon, decide if write else None, only, show))
     if as_json:
-        print(json.dumps(_document(found), ensure_ascii=False), file=out)
+        print(json.dumps(document(found), ensure_ascii=False), file=out)
     else:
-        _print_outcome(found, write, out)
+        print_outcome(found, write, out)
     return IN_THE_WAY if found.blocking else GOOD
 
 
@@ -144,17 +121,17 @@ async def _examine(
         found = Examination(vehicle, link_config.url, mode, findings, n_examined, comes)
         if show is not None:
             show(found)
-        if decide is None or not _to_set(found, only):
+        if decide is None or not found.settable(only):
             return found
         if link.vehicle is not None and link.vehicle.armed:
             raise SourceError(f"{vehicle} is armed; nothing is set in flight")
         if not await asyncio.to_thread(decide, _question(found, only)):
             return found
         for _ in range(ROUNDS):
-            for finding in _to_set(found, only):
+            for finding in found.settable(only):
                 await _set(parameters, finding, found)
             found.findings, found.n_examined = await look()
-            if not _to_set(found, only) or found.refused:
+            if not found.settable(only) or found.refused:
                 break
         if found.written:
             try:
@@ -179,14 +156,9 @@ async def _set(parameters: Parameters, finding: Finding, found: Examination) -> 
     )  # fmt: skip
 
 
-def _to_set(found: Examination, only: Collection[str] = ()) -> list[Finding]:
-    settable = [finding for finding in found.blocking if finding.set_to is not None]
-    return [finding for finding in settable if not only or finding.name in only]
-
-
 def _question(found: Examination, only: Collection[str]) -> str:
-    n = len(_to_set(found, only))
-    return f"Set {_n(n, 'parameter')} of {found.vehicle}? [y/N] "
+    n = len(found.settable(only))
+    return f"Set {counted(n, 'parameter')} of {found.vehicle}? [y/N] "
 
 
 def _ask_at_terminal(question: str) -> bool:
@@ -248,81 +220,3 @@ def _imu_to_be(link: LinkConfig, baud: int, firmware: str) -> str:
     if not room.rate_hz:
         return f"no IMU will be asked for: {room.why}"
     return f"IMU: {room.message} at {room.rate_hz:.0f} Hz will be asked for, less where less comes"
-
-
-# -- what is shown -------------------------------------------------------------------------------
-
-
-def _document(found: Examination) -> dict[str, Any]:
-    return {
-        "vehicle": dataclasses.asdict(found.vehicle),
-        "link": found.where,
-        "mode": found.mode,
-        "n_examined": found.n_examined,
-        "comes": found.comes,
-        "in_the_way": [_plain(finding) for finding in found.blocking],
-        "notes": [_plain(finding) for finding in found.findings if not finding.blocking],
-        "written": found.written,
-        "refused": found.refused,
-        "not_stored": found.not_stored,
-        "reboot_needed": bool(found.reboot_for),
-    }
-
-
-def _plain(finding: Finding) -> dict[str, Any]:
-    document = dataclasses.asdict(finding)
-    del document["blocking"]
-    return document
-
-
-def _print_findings(found: Examination, config: Config, out: TextIO) -> None:
-    print(f"{found.vehicle}, by {found.where}", file=out)
-    if config.feedback.mode == "off":
-        print("feedback.mode is off; examined for odometry", file=out)
-    if found.comes:
-        print(found.comes, file=out)
-    if found.blocking:
-        width = max(len(finding.name) for finding in found.blocking)
-        print(f"\nThese stand in the way of {found.mode}:", file=out)
-        for finding in found.blocking:
-            value = "missing" if finding.value is None else f"is {_number(finding.value)}"
-            wanted = f", wanted {finding.wanted}" if finding.wanted else ""
-            print(f"  {finding.name:{width}}  {value}{wanted}", file=out)
-            print(f"  {'':{width}}  {finding.why}", file=out)
-    for finding in found.findings:
-        if not finding.blocking and finding.value is not None:
-            print(
-                f"\nNot judged: {finding.name} is {_number(finding.value)}, wanted "
-                f"{finding.wanted}; {finding.why}",
-                file=out,
-            )
-    out.flush()
-
-
-def _print_outcome(found: Examination, write: bool, out: TextIO) -> None:
-    print(file=out)
-    for each in found.written:
-        print(f"{each['name']}: {_number(each['from'])} -> {_number(each['to'])}, read back",
-              file=out)  # fmt: skip
-    for refusal in found.refused:
-        print(f"not set: {refusal}", file=out)
-    if found.not_stored:
-        print(f"not stored: {found.not_stored}", file=out)
-    if found.reboot_for:
-        print(f"Reboot the autopilot, for {', '.join(found.reboot_for)}", file=out)
-    if not found.blocking:
-        print(f"Nothing stands in the way of {found.mode} ({found.n_examined} examined)", file=out)
-        return
-    n = len(found.blocking)
-    left = f"{_n(n, 'parameter')} {'stands' if n == 1 else 'stand'} in the way"
-    if _to_set(found) and not write:
-        left += "; `companion doctor --write` sets what can be set"
-    print(left, file=out)
-
-
-def _number(value: float) -> str:
-    return f"{value:.7g}"
-
-
-def _n(n: int, noun: str) -> str:
-    return f"{n} {noun}" + ("" if n == 1 else "s")
