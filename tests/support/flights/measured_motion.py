@@ -42,9 +42,11 @@ class MeasuredMotion:
     """Samples of 100 Hz accelerations, 50 Hz attitudes, with white noise, a bias and a tilt."""
 
     def __init__(
-        self, path: Path, rng: np.random.Generator, seconds: float, axes: Array | None = None
-    ) -> None:
+        self, path: Path, rng: np.random.Generator, seconds: float, axes: Array | None = None,
+        sigma_m_s2: float = 0.08,
+    ) -> None:  # fmt: skip
         self._path, self._rng, self._seconds, self._axes = path, rng, seconds, axes
+        self._sigma_m_s2 = sigma_m_s2
         self.bias_m_s2 = rng.normal(scale=0.08, size=3)
         """Of the accelerometers, in body axes (3,)."""
         self.tilt = rotation_from_vector(rng.normal(scale=0.005, size=3))
@@ -59,6 +61,6 @@ class MeasuredMotion:
             if i % 2 == 0:
                 yield AttitudeSample(t_ns, quaternion_from_rotation(self.tilt @ turn))
             a = (path(t_s + h) - 2 * path(t_s) + path(t_s - h)) / h**2
-            noise = self._rng.normal(scale=0.08, size=3)
+            noise = self._rng.normal(scale=self._sigma_m_s2, size=3)
             force = turn.T @ (a - GRAVITY_NED_M_S2) + self.bias_m_s2 + noise
             yield ImuSample(t_ns, np.zeros(3), force if self._axes is None else self._axes @ force)
