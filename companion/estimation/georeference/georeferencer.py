@@ -25,6 +25,7 @@ from companion.estimation.georeference.trajectory_alignment import (
     Level,
     Scale,
     fit_map,
+    fused,
     reconciled,
 )
 from companion.geometry.transforms import Array, Pose, Similarity, rotation_from_vector
@@ -108,7 +109,7 @@ class Georeferencer:
             samples = [samples[int(i)] for i in chosen]
         level = levelled(mean_rotation(samples), inertial)
         known = self._heights.of(samples, None if level is None else level.world_from_map)
-        others = reduce(reconciled, [*known, *([] if inertial is None else [inertial])], None)
+        others = reduce(fused, [*known, *([] if inertial is None else [inertial])], None)
         prior = others if depths is None else reconciled(others, depths)
         placed = self._by_positions(samples, level, prior)
         if depths is not None:

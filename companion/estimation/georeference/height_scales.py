@@ -6,7 +6,7 @@ import numpy as np
 
 from companion.estimation.georeference.alignment_sample import AlignmentSample
 from companion.estimation.georeference.range_climb import climb_scale
-from companion.estimation.georeference.trajectory_alignment import Scale
+from companion.estimation.georeference.trajectory_alignment import Scale, reconciled
 from companion.estimation.sample_series import SampleSeries
 from companion.geometry.transforms import Array, Pose
 from companion.telemetry import HeightSample, RangeSample, Telemetry
@@ -51,14 +51,15 @@ class HeightScales:
         return len(self._range) >= MIN_RANGES
 
     def of(self, samples: list[AlignmentSample], level: Array | None) -> list[Scale]:
-        """All that are known: by ranges to mapped ground; in a level map also by climbs.
+        """One of each sensor that knows it: by ranges to mapped ground; in a level map by climbs.
 
         `level` is the rotation (3, 3) world_from_map by attitude, None where unknown.
         """
-        found = [self._by_range(samples)]
+        found, by_height = self._by_range(samples), None
         if level is not None:
-            found += [self._by_climb(samples, level), self._by_height(samples, level)]
-        return [scale for scale in found if scale is not None]
+            by_climb, by_height = self._by_climb(samples, level), self._by_height(samples, level)
+            found = found if by_climb is None else reconciled(found, by_climb)
+        return [scale for scale in (found, by_height) if scale is not None]
 
     def _by_range(self, samples: list[AlignmentSample]) -> Scale | None:
         """Scale from rangefinder against mapped ground."""

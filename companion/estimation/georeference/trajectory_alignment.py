@@ -63,15 +63,30 @@ def apart(first: Scale, second: Scale) -> float:
     return float(np.log(first.scale / second.scale))
 
 
+def contradict(first: Scale, second: Scale) -> bool:
+    """True where two scales are further apart than their standard deviations allow."""
+    return abs(apart(first, second)) >= DISAGREE * float(np.hypot(first.sigma, second.sigma))
+
+
 def reconciled(first: Scale | None, second: Scale) -> Scale:
     """The more certain of two scales; where they contradict, sigma is their difference."""
     if first is None:
         return second
     best = min(first, second, key=lambda scale: scale.sigma)
-    off = abs(apart(first, second))
-    if off < DISAGREE * float(np.hypot(first.sigma, second.sigma)):
-        return best
-    return best._replace(sigma=off)
+    return best._replace(sigma=abs(apart(first, second))) if contradict(first, second) else best
+
+
+def fused(first: Scale | None, second: Scale) -> Scale:
+    """The mean of two scales by different sensors, unless they contradict: see `reconciled`."""
+    if first is None or contradict(first, second):
+        return reconciled(first, second)
+    best, other = sorted((first, second), key=lambda scale: scale.sigma)
+    share = best.sigma**2 / (best.sigma**2 + other.sigma**2)
+    return best._replace(
+        scale=best.scale * float(np.exp(share * apart(other, best))),
+        sigma=best.sigma * float(np.sqrt(1.0 - share)),
+        method=f"{first.method} and {second.method}",
+    )  # fmt: skip
 
 
 class _Equations:

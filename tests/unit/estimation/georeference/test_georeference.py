@@ -10,6 +10,7 @@ import pytest
 from companion.config import GeoreferenceConfig
 from companion.estimation.georeference.alignment_sample import AlignmentSample
 from companion.estimation.georeference.georeferencer import Georeferencer, place_new_map
+from companion.estimation.georeference.trajectory_alignment import Scale
 from companion.geometry.transforms import Pose, Similarity, rotation_from_vector, yaw_rotation
 from companion.telemetry import HeightSample, PositionSample, PositionSource, RangeSample
 
@@ -149,6 +150,21 @@ def test_barometer_gives_scale_of_a_climb() -> None:
     assert found is not None
     assert found.method == "barometric height"
     assert found.world_from_map.scale == pytest.approx(TRUTH.scale, rel=0.05)
+
+
+def test_barometer_and_accelerometers_know_a_scale_better_than_either() -> None:
+    kept, ned = places()
+    georeferencer = Georeferencer(GeoreferenceConfig(), None)
+    for i in range(400):
+        down = np.interp(i * 0.1, np.arange(len(ned)) * 0.5, ned[:, 2])
+        georeferencer.take(HeightSample(T0 + i * 100_000_000, 400.0 - down))
+    alone = georeferencer.solve(kept)
+    inertial = Scale(1.1 * TRUTH.scale, 0.06, "accelerometers", 50)
+    both = georeferencer.solve(kept, inertial)
+    assert alone is not None and both is not None
+    assert both.sigma_scale < min(alone.sigma_scale, inertial.sigma)
+    assert alone.world_from_map.scale < both.world_from_map.scale < inertial.scale
+    assert "accelerometers" in both.method and "barometric height" in both.method
 
 
 @pytest.mark.parametrize(("scale", "known"), [(1.0, True), (1.4, False)])
