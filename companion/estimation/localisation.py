@@ -311,8 +311,9 @@ class LocalisationStage:
                 yield from self._tracks.take(message, message.seq == frame.seq, predicted)
             else:
                 yield message
-        added = any(isinstance(m, KeyframeAdded) for m in tracked)
-        if update is None and added and self._segments():
+        due = any(isinstance(m, KeyframeAdded) for m in tracked)
+        due |= self.state is TrackState.TRACKING and self._georeferences.stale(frame.t_ns)
+        if update is None and due and self._segments():
             update = self._map_update()
         if update is not None:
             yield update

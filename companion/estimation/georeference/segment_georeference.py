@@ -34,8 +34,9 @@ MAX_TOLD_WHOLE, N_TOLD = 1000, 400
 about the newest observe: each keyframe tells them again, to all who listen."""
 MAX_COMPARED = 2000
 """Newest keyframes whose displacements say how well the velocity fits."""
-SETTLED_AFTER = 2
-"""Keyframes after which one has been adjusted, and so the frames before it are placed well."""
+SETTLED_AFTER, SETTLED_NS = 2, 1_000_000_000
+"""Keyframes after which one has been adjusted, and so the frames before it are placed well; and so
+are all frames that old: in a hover no keyframe comes."""
 
 
 class SegmentGeoreferences:
@@ -59,7 +60,7 @@ class SegmentGeoreferences:
         self._held: dict[int, Georeference] = {}
         """Of maps that are, or have taken over, that of an earlier flight; nothing moves them."""
         self._main: int | None = None
-        self._revision = 0
+        self._revision = self._solved_ns = 0
         self._acceleration = acceleration
         self._by_acceleration = ByAcceleration()
         self._inertial: dict[int, InertialScale] = {}
@@ -68,6 +69,10 @@ class SegmentGeoreferences:
         self.depths = DepthScales()
         self._samples = SegmentSamples(georeferencer, attitude, body_from_camera)
         self.begun = BegunSegments(georeferencer, self._samples)
+
+    def stale(self, t_ns: int) -> bool:
+        """True where they wait for a keyframe, and frames have told more meanwhile."""
+        return t_ns - self._solved_ns > SETTLED_NS
 
     def of(self, segment: SlamMap) -> Georeference | None:
         """Georeference of a segment; None until known."""
@@ -137,13 +142,14 @@ class SegmentGeoreferences:
         for segment in segments:
             if segment.first_keyframe_id in self._held:
                 continue
-            if final or (segment is segments[-1] and _due(segment)):
+            if final or (segment is segments[-1] and (_due(segment) or self.stale(t_ns))):
+                self._solved_ns = t_ns
                 found = self._georeferencer.solve(
                     self._samples.of(
                         segment,
                         segment.spread_keyframes(MAX_SAMPLES_FINAL if final else MAX_SAMPLES),
                     ),
-                    self._inertial_scale(segment, final),
+                    self._inertial_scale(segment, t_ns, final),
                     self.depths.of(segment),
                 )
                 if found is not None:
@@ -188,7 +194,7 @@ class SegmentGeoreferences:
             n_retired,
         )  # fmt: skip
 
-    def _inertial_scale(self, segment: SlamMap, final: bool) -> Scale | None:
+    def _inertial_scale(self, segment: SlamMap, t_ns: int, final: bool) -> Scale | None:
         """Scale of a segment by accelerometers; None while it is unknown."""
         mount = self._body_from_camera
         if mount is None or not self._attitude.used or not self._acceleration.has_samples:
@@ -204,7 +210,8 @@ class SegmentGeoreferences:
             estimate = self._inertial[key] = InertialScale(lever_m, start)
         newest = sorted(k.t_ns for k in segment.keyframes.values())
         whole = final and self._acceleration.believed
-        until_ns = newest[-1] + 1 if whole else newest[-min(SETTLED_AFTER, len(newest))]
+        settled_ns = max(newest[-min(SETTLED_AFTER, len(newest))], t_ns - SETTLED_NS)
+        until_ns = newest[-1] + 1 if whole else settled_ns
         since_ns = 0 if whole else until_ns - estimate.window_ns
         places = self._places.of(table, segment.unit_of, turned, since_ns, until_ns)
         if whole:
