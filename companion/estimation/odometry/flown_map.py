@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.estimation.odometry.odometry_frame import OdometryFrame
-from companion.estimation.odometry.placed_map import PlacedMap
+from companion.estimation.odometry.placed_map import MapStart, PlacedMap
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Georeference
 
@@ -46,11 +46,11 @@ class FlownMap:
         """Georeference of the map; None before the first."""
         return None if self.placed is None else self.placed.georeference
 
-    def begin(self, placed: PlacedMap, frame: OdometryFrame, map_from_camera: Pose) -> None:
+    def begin(self, placed: PlacedMap, start: MapStart, map_from_camera: Pose) -> None:
         """Go on in another map, from its pose of now."""
-        began = frame.from_world @ placed.world_from_body(map_from_camera)
-        self.placed = replace(placed, began_m=began.translation)
-        self.frame, self.last = frame, None
+        began = start.frame.from_world @ placed.world_from_body(map_from_camera)
+        self.placed = replace(placed, began_m=began.translation, way=start.way)
+        self.frame, self.last = start.frame, None
 
     def resume(self, placed: PlacedMap, from_world: Pose, anchored: bool) -> None:
         """Go on in a stored map and frame."""
@@ -77,14 +77,23 @@ class FlownMap:
         return self.placed.place_of_camera(place_world_m, map_from_camera)
 
     def georeferenced(self, georeference: Georeference) -> float:
-        """Change the georeference, keeping the last pose; by how much the scale has grown."""
+        """Change the georeference, keeping the last pose; by how much the scale has grown.
+
+        What the way since the map's first view is known better by is owed.
+        """
         assert self.placed is not None
-        before = self.placed.georeference.world_from_map.scale
-        self.placed = replace(self.placed, georeference=georeference)
+        before = self.placed.georeference
+        ratio = georeference.world_from_map.scale / before.world_from_map.scale
+        way = self.placed.way if self.placed.way is None else self.placed.way.scaled(ratio)
         if self.last is not None:
-            raw = self.placed.world_from_body(self.last.map_from_camera)
+            placed = replace(self.placed, georeference=georeference)
+            raw = placed.world_from_body(self.last.map_from_camera)
             self.frame = self.frame.holding(self.last.odometry_from_body, raw)
-        return georeference.world_from_map.scale / before
+            if way is not None and self.placed.way is not None and not georeference.has_origin:
+                known_m = self.placed.way.beyond_m(before.sigma_scale)
+                self.frame = self.frame.owing(way.beyond_m(georeference.sigma_scale) - known_m)
+        self.placed = replace(self.placed, georeference=georeference, way=way)
+        return ratio
 
     def corrected(self, map_from_camera: Pose) -> None:
         """Apply a correction of the map: the camera's pose of the last frame now.

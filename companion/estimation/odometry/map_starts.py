@@ -42,24 +42,24 @@ class MapStarts:
         if first is not None and track.t_ns - first.t_ns < YOUNG_NS and course.reckoning.is_good:
             return False
         placed = PlacedMap(segment, georeference, course.flown.camera_from_body)
-        frame, goes_on, off_m = frame_of(
+        start = frame_of(
             placed, pose, first, course.flown.frame,
             None if first is None else course.reckoning.path.at(first.t_ns),
             reckoned, None if last is None else last.place_m, course.gate.max_jump_m,
         )  # fmt: skip
         if (
-            not goes_on and off_m is not None and not georeference.has_origin
-            and reckoned is not None and off_m > CONTRADICTS_SIGMAS * reckoned.sigma_place_m
+            not start.goes_on and start.off_m is not None and not georeference.has_origin
+            and reckoned is not None and start.off_m > CONTRADICTS_SIGMAS * reckoned.sigma_place_m
         ):  # fmt: skip
             return False
         self._stand.in_world |= georeference.has_origin
-        if not goes_on:
+        if not start.goes_on:
             course.reset_counter += course.given
             course.drift.clear()
             if last is not None and georeference.has_origin:
                 course.body.reset()
         course.reckoning.path.clear()
-        course.flown.begin(placed, frame, pose)
+        course.flown.begin(placed, start, pose)
         course.dead_reckoning = False
         course.gate.clear()
         return True

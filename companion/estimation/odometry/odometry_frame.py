@@ -66,6 +66,12 @@ class OdometryFrame:
         moved = Pose(self.from_world.rotation, self.from_world.translation + correction_m)
         return replace(self, from_world=moved)
 
+    def owing(self, correction_m: Array) -> OdometryFrame:
+        """The same where it settles elsewhere by a correction (3,)."""
+        settled = self.settled_from_world
+        moved = Pose(settled.rotation, settled.translation + correction_m)
+        return replace(self, settled_from_world=moved)
+
     def corrected(self, placed: Pose, world_from_body: Pose) -> OdometryFrame:
         """After a correction of the map, by which `placed` is another `world_from_body`.
 
