@@ -45,6 +45,7 @@ from companion.messages import (
     FrameOverdue,
     FrameTracked,
     KeyframeAdded,
+    LoopClosed,
     MapUpdate,
     Message,
     Track,
@@ -300,6 +301,8 @@ class LocalisationStage:
         aligned = predicted is not None and attitude is not None and self._motion.aligned
         rotation_in_map = predicted.rotation if predicted is not None and aligned else None
         tracked = self._tracker.step(frame, Prior(predicted, attitude, rotation_in_map))
+        if any(isinstance(m, LoopClosed) for m in tracked):
+            self._odometry.apply_map_correction()  # by this very frame, in lockstep
         other_map = self._tracker.map is not before
         if other_map or self.state is TrackState.INITIALISING:
             self._motion.reset()
