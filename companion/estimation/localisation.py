@@ -38,7 +38,6 @@ from companion.estimation.telemetry_intake import TelemetryIntake
 from companion.estimation.track_intake import TrackIntake
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
-from companion.geometry.transforms import Array
 from companion.messages import (
     Bytes,
     Frame,
@@ -63,12 +62,9 @@ from companion.timing.clock import Timer
 FINAL_ITERATIONS, OF_LARGE_MAP = 8, 2
 """Iterations of the final global adjustment; 4 and 16 give the sample flight within 0.1 mm. With
 four a map of more than MAX_VARIABLE keyframes takes a second for each hundred."""
-TELEMETRY_KEPT_NS = 600_000_000_000
-"""Older telemetry is only needed at the times of keyframes."""
 MAX_HEAD_TURN_RAD = np.radians(10.0)
 """Of a gimbal's head from where images have it to where it says it is: at 15 frames/s one that
 begins to turn by 90 degrees a second is 6 degrees off."""
-PRUNE_PERIOD_NS = 60_000_000_000
 
 
 class LocalisationStage:
@@ -96,16 +92,16 @@ class LocalisationStage:
             camera.body_from_camera,
             sensors_only=config.feedback.gives_position,
         )
-        self._acceleration = AccelerationIntegral(
+        acceleration = AccelerationIntegral(
             None if camera.gimbal is None else np.array(camera.gimbal.place_body_m)
         )
         self._standing = Standing()
-        body = BodyFilter(self._acceleration)
+        body = BodyFilter(acceleration)
         self._smooth = SmoothOdometry(
             camera, config.feedback.max_jump_m, body, config.feedback.min_quality
         )
         self._georeferences = SegmentGeoreferences(
-            self._georeferencer, self._attitude, self._acceleration, camera.body_from_camera
+            self._georeferencer, self._attitude, acceleration, camera.body_from_camera
         )
         self._odometry = BodyOdometry(
             self._tracker, self._attitude, self._gimbal, self._motion, self._georeferencer,
@@ -114,7 +110,7 @@ class LocalisationStage:
         self._checks = AttitudeChecks(
             self._attitude, self._tracker, self._motion, self._georeferences, self._smooth
         )
-        self._imu = JudgedAcceleration(self._acceleration, self._withdraw_accelerations)
+        self._imu = JudgedAcceleration(acceleration, self._withdraw_accelerations)
         flow = FlowMeter(camera)
         self._flow = FlowOfFrames(
             config.feedback.flow != "off" and self._gimbal is None, flow, self._smooth.ground,
@@ -138,7 +134,6 @@ class LocalisationStage:
         )  # fmt: skip
         self._origin: GeoOrigin | None = None
         """The origin of local NED, where it was told since the last frame."""
-        self._pruned_ns: int | None = None
         self._resumption = MapResumption(
             camera, config.features, self._tracker, self._attitude, self._motion,
             self._georeferences, self._smooth,
@@ -272,7 +267,7 @@ class LocalisationStage:
             found = self._odometry.without_frame(overdue.seq, t_ns)
             if found is not None:
                 yield found
-            self._prune(t_ns)
+            self._telemetry.prune(t_ns, self._segments())
             yield self._frame_tracked(t_ns, overdue.seq, has_picture=False)
 
     def _frame_tracked(self, t_ns: int, seq: int, has_picture: bool) -> FrameTracked:
@@ -342,18 +337,7 @@ class LocalisationStage:
         yield from self._checks.check(frame.t_ns)
         if self._gimbal is not None and self._attitude.used:
             yield from self._gimbal.warnings(frame.t_ns, attitude is not None)
-        self._prune(frame.t_ns)
-
-    def _prune(self, t_ns: int) -> None:
-        """Periodically drop telemetry that is not needed any more."""
-        if self._pruned_ns is not None and t_ns < self._pruned_ns + PRUNE_PERIOD_NS:
-            return
-        self._pruned_ns = t_ns
-        living = {k.keyframe_id: k.t_ns for s in self._segments() for k in s.keyframes.values()}
-        self._attitude.prune(living.keys())
-        when_ns: Array = np.array(sorted(living.values()))
-        self._georeferencer.prune(t_ns - TELEMETRY_KEPT_NS, when_ns)
-        self._acceleration.prune(t_ns - TELEMETRY_KEPT_NS, when_ns)
+        self._telemetry.prune(frame.t_ns, self._segments())
 
     def _map_update(self) -> MapUpdate:
         with self._times("georeference"):

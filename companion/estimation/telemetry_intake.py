@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
+import numpy as np
+
 from companion.config import Measurement
 from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.georeference.depth_scales import DepthScales
@@ -14,6 +16,8 @@ from companion.estimation.lift_off.ground_aiding import GroundAiding
 from companion.estimation.lift_off.optical_flow import FlowMeter
 from companion.estimation.lift_off.standing import Standing
 from companion.estimation.satellites.satellite_watch import SatelliteWatch
+from companion.geometry.transforms import Array
+from companion.slam.map.sparse_map import SlamMap
 from companion.telemetry import (
     AttitudeSample,
     DepthSample,
@@ -25,6 +29,9 @@ from companion.telemetry import (
     Telemetry,
     is_believed,
 )
+
+KEPT_NS, PRUNED_EVERY_NS = 600_000_000_000, 60_000_000_000
+"""Older telemetry is only needed at the times of keyframes."""
 
 
 class TelemetryIntake:
@@ -45,6 +52,7 @@ class TelemetryIntake:
         self._samples: list[Telemetry] = []
         self.n_samples = 0
         """Number of samples that were passed on, or not believed."""
+        self._pruned_ns: int | None = None
 
     def add(self, sample: Telemetry) -> None:
         """Keep a sample."""
@@ -57,6 +65,17 @@ class TelemetryIntake:
                 self._take(sample)
         self.n_samples += len(self._samples)
         self._samples.clear()
+
+    def prune(self, t_ns: int, segments: Iterable[SlamMap]) -> None:
+        """Drop, from time to time, what none of the segments of the map needs any more."""
+        if self._pruned_ns is not None and t_ns < self._pruned_ns + PRUNED_EVERY_NS:
+            return
+        self._pruned_ns = t_ns
+        living = {k.keyframe_id: k.t_ns for s in segments for k in s.keyframes.values()}
+        self._attitude.prune(living.keys())
+        when_ns: Array = np.array(sorted(living.values()))
+        self._georeferencer.prune(t_ns - KEPT_NS, when_ns)
+        self._imu.prune(t_ns - KEPT_NS, when_ns)
 
     def _take(self, sample: Telemetry) -> None:
         if isinstance(sample, PositionSample) and self._gimbal is not None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.imu_verdict import ImuVerdict
+from companion.geometry.transforms import Array
 from companion.messages import Georeference, Warned
 from companion.telemetry import AttitudeSample, ImuSample
 
@@ -67,6 +68,10 @@ class JudgedAcceleration:
                 self._withdraw(change.invalid_since_ns)
         # what is left in the integral after a fault was found right before
         self._integral.believed = self._verdict.believed or bool(self._verdict.fault)
+
+    def prune(self, before_ns: int, keyframes_ns: Array) -> None:
+        """Drop integrals before a time, except at the times of keyframes (N,), sorted."""
+        self._integral.prune(before_ns, keyframes_ns)
 
     def warnings(self) -> list[Warned]:
         """Changes of the verdict since the last call."""
