@@ -10,7 +10,7 @@ OUT ?= out/demo
 # With it each process of the tests, seven a flight, compiles the whole program anew: a second each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint opencl clean reference regression settings deb system-test trials docs bench
+.PHONY: demo test lint loops opencl clean reference regression settings deb system-test trials docs bench
 
 demo: opencl
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
@@ -19,7 +19,8 @@ demo: opencl
 # time too; last what wants the computer for itself. Files in which one of these fails are run once
 # more, one after the other: a machine that others use too may be too busy for one, and in some files
 # one flight goes through all tests.
-test: lint opencl
+test: $(VENV)/.installed-dev opencl
+	$(MAKE) --no-print-directory --jobs=2 lint loops
 	$(BIN)/pytest -m "not real_time" --ignore tests/live --ignore tests/system $(THREE)
 	$(BIN)/pytest -m "real_time and not alone" tests/live $(REAL_TIME) $(THREE) || $(ONCE_MORE)
 	$(BIN)/pytest tests/system tests/firmware || $(ONCE_MORE)
@@ -39,6 +40,10 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Compiled once, beside the checks above: else each worker and each flight of the tests does it.
+loops: $(VENV)/.installed-dev
+	$(BIN)/python -c "import companion.stages.localisation_work"
 
 # What a change does to the sample flight, against the results that are kept of it.
 regression: opencl

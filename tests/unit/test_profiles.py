@@ -60,7 +60,7 @@ def test_unknown_profile_names_those_there_are(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"own\.toml: computer\.profile: wanted one of .*pi5"):
         load_config(path)
     result = companion("check-config", "--profile", "pi9")
-    assert result.returncode == 2 and "pi5" in result.stderr.splitlines()[-1]
+    assert result.status == 2 and "pi5" in result.stderr.splitlines()[-1]
     assert "pi9" in refused(companion("check-config", "--set", "computer.profile=pi9"))
 
 

@@ -84,7 +84,7 @@ def _write_video(
     edit: Callable[[int, Image], Image] | None,
 ) -> None:
     with av.open(str(source)) as reader, av.open(str(path), "w") as writer:
-        stream = writer.add_stream("libx264", rate=10, options={"crf": "20", "preset": "veryfast"})
+        stream = writer.add_stream("libx264", rate=10, options={"crf": "20", "preset": "ultrafast"})
         stream.width, stream.height, stream.pix_fmt = 640, 480, "yuv420p"
         written = 0
         for index, frame in enumerate(reader.decode(video=0)):

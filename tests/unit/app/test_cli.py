@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import re
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -16,35 +18,40 @@ from companion.config import Config
 from companion.config_file import load_config
 from companion.errors import InputError
 from companion.products.export.exports import PRODUCTS
+from tests.support.processes import program
 from tests.support.processes.closed_pipe import into_closed_pipe
+from tests.support.processes.program import Run
 
 SAMPLE = Path(__file__).parents[3] / "sample" / "survey"
 
 
-def companion(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "companion", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+def companion(*arguments: str | Path) -> Run:
+    """A command in this process: one of its own takes more than a second to load what it needs."""
+    stdout, stderr = io.StringIO(), io.StringIO()
+    with redirect_stdout(stdout), redirect_stderr(stderr):
+        try:
+            status = main([*map(str, arguments)])
+        except SystemExit as ended:  # argparse
+            status = int(ended.code or 0)
+    return Run(status, stdout.getvalue(), stderr.getvalue(), Path())
 
 
-def refused(result: subprocess.CompletedProcess[str]) -> str:
+def refused(run: Run) -> str:
     """The line that says why, after making sure that it is the only one."""
-    assert result.returncode == 2
-    assert result.stdout == ""
-    (line,) = result.stderr.splitlines()
-    assert line.startswith("companion: error: ")
-    return line
+    assert run.stdout == ""
+    return program.refused(run)
 
 
 def test_version() -> None:
     result = companion("--version")
-    assert (result.returncode, result.stdout) == (0, f"companion {__version__}\n")
+    assert (result.status, result.stdout) == (0, f"companion {__version__}\n")
 
 
 def test_check_config_prints_what_it_read(tmp_path: Path) -> None:
     given = tmp_path / "given.toml"
     given.write_text("[expert.depth]\nstride = 7\n")
     result = companion("check-config", "--config", given, "--set", "opencl.device=gpu")
-    assert (result.returncode, result.stderr) == (0, "")
+    assert (result.status, result.stderr) == (0, "")
     printed = tmp_path / "printed.toml"
     printed.write_text(result.stdout)
     assert load_config(printed) == load_config(given, ["opencl.device=gpu"]) != Config()
@@ -54,7 +61,7 @@ def test_check_config_looks_beyond_the_words(tmp_path: Path) -> None:
     line = refused(companion("check-config", "--set", "link.url=rubbish"))
     assert 'link.url: "rubbish" must begin with one of serial:' in line
     result = companion("check-config", "--set", f"camera.calibration={tmp_path / 'none.toml'}")
-    assert result.returncode == 0  # it may be on the drone
+    assert result.status == 0  # it may be on the drone
     assert result.stderr.startswith("companion: warning: camera.calibration: ")
     wrong = tmp_path / "wrong.toml"
     wrong.write_text("width = 640\nheight = 480\n")
@@ -81,7 +88,7 @@ def test_an_old_configuration_is_written_anew(tmp_path: Path) -> None:
     given.write_text("[features]\nn_features = 700\n")
     line = f"companion: {given}: features.n_features is now expert.features.n_features\n"
     assert companion("check-config", "--config", given).stderr == line
-    assert companion("check-config", "--config", given, "--migrate").returncode == 0
+    assert companion("check-config", "--config", given, "--migrate").status == 0
     result = companion("check-config", "--config", given)
     assert (result.stderr, "n_features = 700" in result.stdout) == ("", True)
     assert "--config" in refused(companion("check-config", "--migrate"))
@@ -126,18 +133,15 @@ def test_out_that_cannot_be_written(command: tuple[str | Path, ...]) -> None:
 )
 def test_usage(arguments: list[str], named: str) -> None:
     result = companion(*arguments)
-    assert result.returncode == 2
+    assert result.status == 2
     assert named in result.stderr.splitlines()[-1]
     assert "Traceback" not in result.stderr
 
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        ["--help"], ["replay", "--help"], ["--version"], ["check-config"], ["devices"],
-        ["devices", "--opencl"], ["flights", "list", "--flights", "."],
-    ],
-)  # fmt: skip
+    [["--help"], ["check-config"], ["devices"], ["flights", "list", "--flights", "."]],
+)
 def test_output_that_nobody_reads_is_no_error(arguments: list[str]) -> None:
     assert into_closed_pipe(*arguments) == (READER_GONE, "")
     assert READER_GONE == 141
