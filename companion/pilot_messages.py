@@ -95,6 +95,7 @@ GPS_TURNED = PilotMessage(WARNING, "GPS track wrong: not used")
 GPS_GONE = PilotMessage(WARNING, "GPS lost or jammed")
 GPS_POOR = PilotMessage(WARNING, "GPS accuracy poor: not used")
 GPS_AGAIN = PilotMessage(INFO, "GPS agrees with vision: used again")
+GPS_WITHDRAWN = PilotMessage(NOTICE, "vision was wrong, not GPS: used again")
 SOURCE_VISION = PilotMessage(WARNING, "EKF sources switched: no GPS")
 SOURCE_SATELLITES = PilotMessage(NOTICE, "EKF sources switched: GPS again")
 SOURCE_NOT = PilotMessage(WARNING, "EKF sources not switched, see its log")
@@ -251,6 +252,7 @@ OF_WARNING: Mapping[str, PilotMessage] = {
     "no satellite positions any more": GPS_GONE,
     "satellite positions are too inaccurate and are not used": GPS_POOR,
     "satellite positions agree with vision again and are used": GPS_AGAIN,
+    "vision failed after it had contradicted satellite positions: they are used": GPS_WITHDRAWN,
     "the EKF's sources are switched to vision": SOURCE_VISION,
     "the EKF's sources are switched to satellites": SOURCE_SATELLITES,
     "the EKF's sources could not be switched": SOURCE_NOT,

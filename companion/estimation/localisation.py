@@ -121,7 +121,7 @@ class LocalisationStage:
         )
         self._tracks = TrackIntake(
             self._tracker, self._attitude, self._gimbal, self._motion, self._georeferences,
-            self._satellites, self._odometry, self._smooth,
+            self._odometry, self._smooth,
         )  # fmt: skip
         self._shutter = None if camera.readout_ms == 0 else ShutterOfFrames(camera)
         self._lens = LensWatch(camera)
@@ -326,7 +326,6 @@ class LocalisationStage:
                 yield self._map_update()
         yield from self._imu.warnings()
         yield from self._georeferencer.warnings()
-        yield from self._satellites.warnings()
         if not stands:
             tracker = self._tracker
             yield from self._margin.take(
@@ -334,6 +333,11 @@ class LocalisationStage:
                 tracker.view_of(frame.seq), tracker.map, tracker.n_features, tracker.feature_ratio,
                 tracker.nearly_drowned,
             )  # fmt: skip
+            self._satellites.take_frame(
+                frame.t_ns, tracker.map.first_keyframe_id, self._tracks.seen,
+                self._georeferences.of(tracker.map), self._margin.is_near,
+            )  # fmt: skip
+        yield from self._satellites.warnings()
         yield from self._checks.check(frame.t_ns)
         if self._gimbal is not None and self._attitude.used:
             yield from self._gimbal.warnings(frame.t_ns, attitude is not None)

@@ -11,7 +11,6 @@ from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.georeference.segment_georeference import SegmentGeoreferences
 from companion.estimation.gimbal.gimbal_head import GimbalHead
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
-from companion.estimation.satellites.satellite_watch import SatelliteWatch
 from companion.geometry.transforms import Pose
 from companion.messages import Message, Track, TrackState
 from companion.slam.tracking.tracker import Tracker
@@ -22,11 +21,11 @@ class TrackIntake:
 
     def __init__(
         self, tracker: Tracker, attitude: CameraAttitude, gimbal: GimbalHead | None,
-        motion: CameraMotion, georeferences: SegmentGeoreferences, satellites: SatelliteWatch,
-        odometry: BodyOdometry, smooth: SmoothOdometry,
+        motion: CameraMotion, georeferences: SegmentGeoreferences, odometry: BodyOdometry,
+        smooth: SmoothOdometry,
     ) -> None:  # fmt: skip
         self._tracker, self._attitude, self._gimbal = tracker, attitude, gimbal
-        self._motion, self._georeferences, self._satellites = motion, georeferences, satellites
+        self._motion, self._georeferences = motion, georeferences
         self._odometry, self._smooth = odometry, smooth
         self.seen: Pose | None = None
         """`map_from_camera` of the newest frame, None while it is lost or stands."""
@@ -61,8 +60,6 @@ class TrackIntake:
         if is_now:
             self.seen = pose
             self._motion.last = track
-            placed = self._georeferences.of(slam_map)
-            self._satellites.take_pose(track.t_ns, slam_map.first_keyframe_id, pose, placed)
             yield self._odometry.of_track(track)
         if not is_now or self._smooth.found_again.certain:
             mount = self._attitude.correction[0]

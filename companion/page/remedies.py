@@ -77,6 +77,7 @@ OF_WARNING: Mapping[str, str] = {
     "satellite positions are too inaccurate and are not used":
         "Leave modes that fly by GPS; give its antenna a free sky.",
     "satellite positions agree with vision again and are used": NOTHING,
+    "vision failed after it had contradicted satellite positions: they are used": NOTHING,
     "the EKF's sources are switched to vision":
         "The vehicle flies without GPS (expert.gps.vision_set).",
     "the EKF's sources are switched to satellites": NOTHING,

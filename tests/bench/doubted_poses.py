@@ -39,7 +39,7 @@ def sent(flight: Flight, config: Config, samples: list[Telemetry], doubt: bool) 
     """Places of the poses sent, by their times."""
     stage, poses = LocalisationStage(config, flight.camera, StageTimes()), PosesSent(config)
     if not doubt:
-        stage._satellites = _Believing(flight.camera.camera_from_body)
+        stage._telemetry._satellites = _Believing(flight.camera.camera_from_body)
     for message in in_order_of_time(samples, flight.frames(flight.start_ns, flight.stop_ns)):
         poses.take(message)
         for out in stage.step(message):

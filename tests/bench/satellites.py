@@ -20,7 +20,7 @@ from companion.config_file import load_config
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.satellites.satellite_watch import SIGMAS, SatelliteWatch
 from companion.geometry.transforms import Pose
-from companion.messages import Georeference, Odometry, Track, Warned
+from companion.messages import Georeference, Warned
 from companion.runtime.in_order import in_order_of_time
 from companion.telemetry import AttitudeSample, PositionSample, PositionSource, Telemetry
 from companion.timing.clock import StageTimes
@@ -31,29 +31,28 @@ BACK_S = 10.0
 
 
 class Seen(NamedTuple):
-    """A frame that was tracked: its time, map, pose and the place of the map."""
+    """A frame: its time, map, pose, the place of the map, and whether tracking may fail."""
 
     t_ns: int
     map_id: int
-    map_from_camera: Pose
+    map_from_camera: Pose | None
     placed: Georeference | None
+    near_limits: bool
 
 
 def _watch(stage: LocalisationStage) -> list[Seen]:
     """What the watch gets of each frame, kept as it comes."""
     seen: list[Seen] = []
-    of_track = stage._odometry.of_track
+    take_frame = stage._satellites.take_frame
 
-    def seeing(track: Track) -> Odometry:
-        if track.map_from_camera is not None:
-            segment = stage._tracker.map
-            seen.append(
-                Seen(track.t_ns, segment.first_keyframe_id, track.map_from_camera,
-                     stage._georeferences.of(segment))
-            )  # fmt: skip
-        return of_track(track)
+    def seeing(
+        t_ns: int, map_id: int, map_from_camera: Pose | None, placed: Georeference | None,
+        near_limits: bool = False,
+    ) -> None:  # fmt: skip
+        seen.append(Seen(t_ns, map_id, map_from_camera, placed, near_limits))
+        take_frame(t_ns, map_id, map_from_camera, placed, near_limits)
 
-    stage._odometry.of_track = seeing  # type: ignore[method-assign]
+    stage._satellites.take_frame = seeing  # type: ignore[method-assign]
     return seen
 
 
@@ -103,7 +102,7 @@ def watched(
     waiting = next(poses, None)
     for sample in samples:
         while waiting is not None and waiting.t_ns < sample.t_ns:
-            watch.take_pose(*waiting)
+            watch.take_frame(*waiting)
             waiting = next(poses, None)
         if isinstance(sample, AttitudeSample):
             watch.take_time(sample.t_ns)

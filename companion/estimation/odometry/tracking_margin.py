@@ -47,6 +47,8 @@ class TrackingMargin:
         """Times, and what they are near, "" if nothing."""
         self._last: tuple[int, SlamMap, Array] | None = None
         """The last tracked frame: its number, its map, and the points (N, 3) that it saw."""
+        self.is_near = False
+        """True if the newest frame was near a limit."""
         self._said: set[str] = set()
         self._near_ns = 0
 
@@ -62,6 +64,7 @@ class TrackingMargin:
         t_ns, limit = track.t_ns, self._limit(track, view, slam_map, n_seen, ratio)
         if drowned:
             limit = TOO_FAINT
+        self.is_near = bool(limit)
         if limit is not None:
             self._recent.append((t_ns, limit))
         while self._recent and t_ns - self._recent[0][0] > WINDOW_NS:

@@ -35,8 +35,9 @@ worse wanders more."""
 WRONG_VELOCITY = 0.2
 """Of a map, as a share of the way, by a velocity of the autopilot that nobody has judged yet: a
 compass or a lens of optical flow that is off turns and stretches it by as much."""
-PATH = 0.01
-"""Drift of vision, as a share of the way."""
+PATH, PATH_NEAR_LIMITS = 0.01, 0.3
+"""Drift of vision, as a share of the way: as a rule, and with few points in view. With 40 to 50 of
+them, and every other picture dropped, `sample/survey` goes astray by 0.4 m in 1.4 m."""
 LAG_S = 0.12
 """By which stamps of receivers and of an autopilot's link are off, before they have shown it:
 counts where speed changes."""
@@ -60,6 +61,8 @@ class _Pair(NamedTuple):
     gps_speed_m_s: Array
     place_map: Array
     speed_map: Array
+    near_path_m: float
+    """Vision's way near its limits up to then."""
 
 
 class Change(NamedTuple):
@@ -87,7 +90,8 @@ class SatelliteResiduals:
 
     def __init__(self, camera_from_body: Pose) -> None:
         self._camera_from_body = camera_from_body
-        self._poses: deque[tuple[float, Array]] = deque(maxlen=64)
+        self._poses: deque[tuple[float, Array, float]] = deque(maxlen=64)
+        """Times, places in the map, and vision's way near its limits up to then."""
         self._pairs: deque[_Pair] = deque()
         self._map_id: int | None = None
         self._placed: Georeference | None = None
@@ -99,11 +103,14 @@ class SatelliteResiduals:
         """True where the map may be of a wrong velocity."""
         self.path_m = 0.0
         """Length of vision's way since the first pose, metres."""
+        self._near_path_m = 0.0
+        """The same, near its limits."""
 
     def take_pose(
-        self, t_ns: int, map_id: int, map_from_camera: Pose, placed: Georeference | None
-    ) -> None:
-        """Take the pose of a frame that was tracked."""
+        self, t_ns: int, map_id: int, map_from_camera: Pose, placed: Georeference | None,
+        near_limits: bool = False,
+    ) -> None:  # fmt: skip
+        """Take the pose of a frame that was tracked, maybe near the limits of tracking."""
         if placed is None:
             self.clear()
             return
@@ -115,10 +122,12 @@ class SatelliteResiduals:
             self.placed_since_s = 1e-9 * t_ns
         t_s, place = 1e-9 * t_ns, map_from_camera.apply(self._camera_from_body.translation / scale)
         if self._poses:
-            self.path_m += scale * float(np.linalg.norm(place - self._poses[-1][1]))
+            step_m = scale * float(np.linalg.norm(place - self._poses[-1][1]))
+            self.path_m += step_m
+            self._near_path_m += step_m * near_limits
             if t_s - self._poses[-1][0] > MAX_AHEAD_S:
                 self._poses.clear()
-        self._poses.append((t_s, place))
+        self._poses.append((t_s, place, self._near_path_m))
 
     def clear(self) -> None:
         """Begin anew."""
@@ -152,6 +161,11 @@ class SatelliteResiduals:
         while self._pairs and self._pairs[0].t_s < t_s:
             self._pairs.popleft()
 
+    def keep_until(self, t_s: float) -> None:
+        """Forget pairs after a time."""
+        while self._pairs and self._pairs[-1].t_s > t_s:
+            self._pairs.pop()
+
     def offset_m(self, over_s: float) -> Array | None:
         """Mean residual (3,) over the last seconds; None without pairs."""
         if not self._pairs or self._placed is None:
@@ -164,7 +178,7 @@ class SatelliteResiduals:
         """Change of the residual over each window that the pairs reach back to."""
         if len(self._pairs) < 4 or self._placed is None:
             return []
-        times, residual, world, gps, speeds, own_speeds = self._arrays()
+        times, residual, world, gps, speeds, own_speeds, near_paths_m = self._arrays()
         lag_s, sigma_lag_s = _lag_of(times, residual, own_speeds)
         residual = residual - lag_s * own_speeds
         white, rates = self._white(residual), self._rates
@@ -190,17 +204,18 @@ class SatelliteResiduals:
             span_s = float(now_s - times[base].mean())
             level_m = float(np.hypot(*flown[:2]))
             way_m = float(steps_m[inside[:-1]].sum())
+            astray_m = PATH_NEAR_LIMITS * (near_paths_m[-1] - near_paths_m[base][0])
             faster = float(np.linalg.norm(own_speed_now - own_speeds[base].mean(0)))
             shared = np.sqrt(1.0 / n_base + 1.0 / n_now)
             placed = self._placed
             of_vision = np.array([
                 PATH * way_m, placed.sigma_scale * level_m, placed.sigma_yaw_rad * level_m,
-                sigma_lag_s * faster, WRONG_VELOCITY * level_m * self.velocity_unproved,
+                sigma_lag_s * faster, WRONG_VELOCITY * level_m * self.velocity_unproved, astray_m,
             ])  # fmt: skip
             horizontal = np.linalg.norm([white[0] * shared, rates[0] * span_s, *of_vision])
             vertical = np.linalg.norm([
                 white[1] * shared, rates[1] * span_s, PATH * way_m, TILT_RAD * way_m,
-                placed.sigma_scale * abs(flown[2]), sigma_lag_s * faster,
+                placed.sigma_scale * abs(flown[2]), sigma_lag_s * faster, astray_m,
             ])  # fmt: skip
             speed = speeds[inside].mean(0) - own_speeds[inside].mean(0)[:2]
             sigma_speed = np.linalg.norm([SIGMA_SPEED_M_S, *(of_vision[1:] / span_s)])
@@ -219,22 +234,29 @@ class SatelliteResiduals:
         """
         if len(self._pairs) < 3 or self._placed is None:
             return None
-        times, residual, *_, own_speeds = self._arrays()
+        times, residual, *_, own_speeds, near_paths_m = self._arrays()
         before = (times < times[-1]) & (times >= times[-1] - JUMP_OVER_S)
         if not before.any():
             return None
         white = self._white(residual[:-1])
         lag_m = LAG_S * float(np.linalg.norm(own_speeds[-1] - own_speeds[before].mean(0)))
+        astray_m = PATH_NEAR_LIMITS * (near_paths_m[-1] - near_paths_m[before][0])
         moved: Array = residual[-1] - residual[before].mean(0)
-        return moved, float(np.hypot(1.5 * white[0], lag_m)), float(np.hypot(1.5 * white[1], lag_m))
+        level_m, up_m = (float(np.linalg.norm([1.5 * w, lag_m, astray_m])) for w in white)
+        return moved, level_m, up_m
 
-    def _arrays(self) -> tuple[Array, Array, Array, Array, Array, Array]:
-        """Times, residuals, vision's places and positions of satellites; speeds of these."""
+    def _arrays(self) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+        """Times, residuals, vision's places and positions of satellites; speeds of these.
+
+        Last vision's way near its limits up to then.
+        """
         assert self._placed is not None
         to_world = self._placed.world_from_map
-        t_s, gps, speeds, places, own = (np.array(each) for each in zip(*self._pairs, strict=True))
-        world = to_world.apply(places)
-        return t_s, gps - world, world, gps, speeds, to_world.scale * own @ to_world.rotation.T
+        t_s, gps, speeds, places, own, near_paths_m = (
+            np.array(each) for each in zip(*self._pairs, strict=True)
+        )
+        world, own_speeds = to_world.apply(places), to_world.scale * own @ to_world.rotation.T
+        return t_s, gps - world, world, gps, speeds, own_speeds, near_paths_m
 
     @property
     def _rates(self) -> tuple[float, float]:
@@ -252,22 +274,23 @@ class SatelliteResiduals:
             up = max(up, 1.05 * float(np.median(steps[:, 2])))
         return max(WHITE_M[0], level), max(WHITE_M[1], up)
 
-    def _vision_at(self, t_s: float) -> tuple[Array, Array] | None:
-        """Place and speed of the body in the map; None where vision is not known."""
+    def _vision_at(self, t_s: float) -> tuple[Array, Array, float] | None:
+        """Place and speed of the body in the map, and the way near limits; None if not known."""
         if len(self._poses) < 2 or self._placed is None:
             return None
-        times = [t for t, _ in self._poses]
+        times = [t for t, *_ in self._poses]
         if not times[0] <= t_s <= times[-1] + MAX_AHEAD_S:
             return None
         i = int(np.clip(np.searchsorted(times, t_s), 1, len(times) - 1))
         first = max(0, int(np.searchsorted(times, times[i] - SPEED_OVER_S)) - 1)
         first = min(first, i - 1)
-        (t0, p0), (t1, p1), (tb, pb) = self._poses[first], self._poses[i], self._poses[i - 1]
+        (t0, p0, _), (tb, pb, _) = self._poses[first], self._poses[i - 1]
+        t1, p1, near_path_m = self._poses[i]
         speed = (p1 - p0) / (t1 - t0)
         if t_s <= t1:
             share = (t_s - tb) / (t1 - tb)
-            return pb + share * (p1 - pb), speed
-        return p1 + (t_s - t1) * speed, speed
+            return pb + share * (p1 - pb), speed, near_path_m
+        return p1 + (t_s - t1) * speed, speed, near_path_m
 
 
 def _lag_of(times: Array, residual: Array, own_speeds: Array) -> tuple[float, float]:

@@ -6,6 +6,9 @@ position that stands while the vehicle moves, a track that is turned, a receiver
 silent. While satellites are doubted no position of the autopilot places the map: its own estimate
 follows them. They are used again once the difference is what it was before, but for what vision
 may have drifted by since; a position that stays elsewhere stays doubted.
+
+Where vision fails right after it has accused satellites, it was the one that was wrong: the doubt
+is withdrawn. Should vision come back where it was and still contradict them, they are doubted anew.
 """
 
 from __future__ import annotations
@@ -61,6 +64,9 @@ this long, if they go where vision goes, or if there is none: a map needs them f
 SETTLED_S = 10.0
 """Time for which a map has been placed before it is held against anything: its first scale is by a
 few positions, and moves by more than is stated."""
+ACCUSED_S, LOST_S = 3.0, 0.5
+"""Vision that is lost for the second had gone astray within the first before: by the shorter of the
+windows, which its fault is found by."""
 
 
 class Doubt(Enum):
@@ -75,7 +81,10 @@ class Doubt(Enum):
     POOR = "satellite positions are too inaccurate and are not used"
 
 
+BY_VISION = (Doubt.PULL, Doubt.HEIGHT, Doubt.TURNED)
+"""For which vision is the only witness: what jumps or stands shows in the positions themselves."""
 USED_AGAIN = "satellite positions agree with vision again and are used"
+WITHDRAWN = "vision failed after it had contradicted satellite positions: they are used"
 
 
 class SatelliteWatch:
@@ -94,6 +103,10 @@ class SatelliteWatch:
         self._anchor: Array | None = None
         """Residual (3,) before the doubt began; None where that map is gone."""
         self._anchor_path_m = self._doubt_s = self._agrees_since_s = 0.0
+        self._apart_since_s = 0.0
+        """Begin of the window over which satellites had moved away from vision."""
+        self._tracked_s = 0.0
+        self._lost_since_s: float | None = None
         self._was_judged = True
         """True if the newest position was held against vision."""
         self._newest_ns = self._heard_ns = 0
@@ -114,13 +127,32 @@ class SatelliteWatch:
         out, self._warnings = self._warnings, []
         return out
 
-    def take_pose(
-        self, t_ns: int, map_id: int, map_from_camera: Pose, placed: Georeference | None
-    ) -> None:
-        """Take the pose of a frame that was tracked, with the place of its map if known."""
-        if map_id != self._map_id:
+    def take_frame(
+        self, t_ns: int, map_id: int, map_from_camera: Pose | None, placed: Georeference | None,
+        near_limits: bool = False,
+    ) -> None:  # fmt: skip
+        """Take the pose of a frame, None where it is lost, with the place of its map if known.
+
+        `near_limits` where tracking may fail.
+        """
+        t_s = 1e-9 * t_ns
+        other_map = map_from_camera is not None and map_id != self._map_id
+        if map_from_camera is None and self._lost_since_s is None:
+            self._lost_since_s = t_s
+        if self._lost_since_s is not None and (other_map or t_s - self._lost_since_s >= LOST_S):
+            self._withdraw(t_ns)
+        if map_from_camera is None:
+            return
+        if other_map:
             self._map_id, self._anchor = map_id, None
-        self._residuals.take_pose(t_ns, map_id, map_from_camera, placed)
+        self._tracked_s, self._lost_since_s = t_s, None
+        self._residuals.take_pose(t_ns, map_id, map_from_camera, placed, near_limits)
+
+    def _withdraw(self, t_ns: int) -> None:
+        """End a doubt of which vision that has failed is the only witness."""
+        if self._doubt in BY_VISION and self._doubt_s >= self._tracked_s - ACCUSED_S:
+            self._residuals.keep_until(self._apart_since_s)
+            self._end(t_ns, WITHDRAWN)
 
     def take_time(self, t_ns: int) -> None:
         """The autopilot is heard at this time: satellites may have gone silent."""
@@ -194,6 +226,7 @@ class SatelliteWatch:
             # of a slow change the beginning of a short window is off, too
             longer = [c.base_m for c in changes if change.window_s <= c.window_s <= ANCHOR_S]
             self._begin(t_ns, doubt, [change.base_m, *longer][-1], detail)
+            self._apart_since_s = self._doubt_s - change.window_s
 
     def _begin(self, t_ns: int, doubt: Doubt, anchor: Array | None, detail: str) -> None:
         self._doubt, self._anchor = doubt, anchor if self._settled(t_ns) else None
@@ -234,11 +267,14 @@ class SatelliteWatch:
         if self._anchor is None and self._doubt in (Doubt.GONE, Doubt.POOR):
             wait_s = 0.0 if self._doubt is Doubt.GONE else AGAIN_S
         if t_s - self._agrees_since_s >= wait_s:
-            self._doubt = None
             self._residuals.keep_since(self._agrees_since_s)
-            self._warnings.append(
-                Warned(t_ns, USED_AGAIN, f"after {t_s - self._doubt_s:.0f} s", good=True)
-            )
+            self._end(t_ns, USED_AGAIN)
+
+    def _end(self, t_ns: int, what: str) -> None:
+        """Satellites are used from now on."""
+        self._doubt = None
+        detail = f"after {1e-9 * t_ns - self._doubt_s:.0f} s"
+        self._warnings.append(Warned(t_ns, what, detail, good=True))
 
 
 def _doubt_of(change: Change) -> tuple[Doubt, Change, str] | None:
@@ -273,6 +309,6 @@ def _named(change: Change, off_m: float) -> tuple[Doubt, Change, str]:
 
 def doubts(warning: Warned) -> bool | None:
     """True where a warning begins a doubt, False where it ends one; None for any other."""
-    if warning.what == USED_AGAIN:
+    if warning.what in (USED_AGAIN, WITHDRAWN):
         return False
     return True if any(warning.what == doubt.value for doubt in Doubt) else None

@@ -12,6 +12,7 @@ from companion.estimation.satellites.satellite_watch import (
     POOR_M,
     SETTLED_S,
     USED_AGAIN,
+    WITHDRAWN,
     Doubt,
     SatelliteWatch,
     doubts,
@@ -62,6 +63,9 @@ class Flown:
         self.t_s = 0.0
         self.map_id = 0
         self.tracked = True
+        self.near_limits = False
+        self.astray_m = np.zeros(3)
+        """By which vision is off."""
         self.velocity_unproved = False
         self.used: list[tuple[float, bool]] = []
         self.frozen: Array | None = None
@@ -69,6 +73,7 @@ class Flown:
     def fly(
         self, seconds: float, off: Path = lambda _: np.zeros(3), *, stands: bool = False,
         silent: bool = False, sigma_m: float = 1.2, heard: bool = True, drift: float = 0.0,
+        strays_m_s: Array | None = None,
     ) -> list[Warned]:  # fmt: skip
         """`off` is by seconds since this began; `drift` that of vision, as a share of the way."""
         said: list[Warned] = []
@@ -76,9 +81,12 @@ class Flown:
         for step in range(round(seconds * 20)):
             self.t_s = began_s + 0.05 * (step + 1)
             t_ns = START_NS + round(self.t_s * S)
-            place = self.path(self.t_s) * (1 + drift)
-            if self.tracked:
-                self.watch.take_pose(t_ns, self.map_id, self.camera_at(place), PLACED)
+            if strays_m_s is not None:
+                self.astray_m = self.astray_m + 0.05 * strays_m_s
+            seen = self.camera_at(self.path(self.t_s) * (1 + drift) + self.astray_m)
+            self.watch.take_frame(
+                t_ns, self.map_id, seen if self.tracked else None, PLACED, self.near_limits
+            )
             if heard:
                 self.watch.take_time(t_ns)
             if step % 4 == 0 and not silent:
@@ -285,6 +293,75 @@ def test_where_vision_is_gone_for_long_they_are_used_again() -> None:
     assert [each.what for each in said] == [USED_AGAIN]
 
 
+STRAYS_M_S = np.array([-1.0, 1.4, 0.0])
+PULL_M_S = np.array([0.6, 0.8, 0.0])
+
+
+@pytest.mark.parametrize("path", [circle, hover, line])
+def test_vision_near_its_limits_accuses_nobody(path: Path) -> None:
+    flown = Flown(path)
+    assert flown.fly(FAULT_S) == []
+    flown.near_limits = True
+    assert flown.fly(1.0, strays_m_s=STRAYS_M_S) == []
+    flown.tracked = False
+    assert flown.fly(1.0) == []
+    assert all(used for _, used in flown.used)
+
+
+@pytest.mark.parametrize("path", [circle, hover, line])
+def test_vision_near_its_limits_still_sees_a_jump(path: Path) -> None:
+    flown = Flown(path)
+    flown.near_limits = True
+    assert flown.fly(FAULT_S) == []
+    said = flown.fly(3.0, off=lambda _: np.array([30.0, -40.0, 0.0]))
+    assert [each.what for each in said] == [Doubt.JUMP.value]
+    assert after_s(said[0]) < 0.6
+
+
+@pytest.mark.parametrize("begins_another_map", [False, True])
+def test_a_doubt_is_withdrawn_where_vision_fails_right_after_it(begins_another_map: bool) -> None:
+    flown = Flown(circle)
+    assert flown.fly(FAULT_S) == []
+    said = flown.fly(2.0, strays_m_s=STRAYS_M_S)
+    assert [each.what for each in said] == [Doubt.PULL.value]
+    flown.tracked = False
+    said = flown.fly(0.2 if begins_another_map else 0.6)
+    if begins_another_map:
+        flown.tracked, flown.map_id = True, 7
+        said += flown.fly(0.2)
+    assert [each.what for each in said] == [WITHDRAWN]
+    assert flown.fly(0.4) == [] and flown.used[-1][1]
+
+
+def test_vision_that_was_astray_and_comes_back_says_nothing_more() -> None:
+    flown = Flown(circle)
+    flown.fly(FAULT_S)
+    flown.fly(2.0, strays_m_s=STRAYS_M_S)
+    flown.tracked = False
+    flown.fly(1.0)
+    flown.tracked, flown.astray_m = True, np.zeros(3)
+    assert flown.fly(30.0) == []
+
+
+def test_vision_that_comes_back_and_still_contradicts_is_believed() -> None:
+    flown = Flown(circle)
+    flown.fly(FAULT_S)
+    assert flown.fly(3.0, lambda t: PULL_M_S * max(t, 0.0)) != []
+    flown.tracked = False
+    said = flown.fly(1.0, lambda t: PULL_M_S * (3.0 + t))
+    assert [each.what for each in said] == [WITHDRAWN]
+    flown.tracked = True
+    said = flown.fly(2.0, lambda t: PULL_M_S * (4.0 + t))
+    assert [each.what for each in said] == [Doubt.PULL.value]
+
+
+def test_vision_that_fails_long_after_its_word_is_still_believed() -> None:
+    flown, _ = faulty(circle, off=lambda t: PULL_M_S * max(t, 0.0))
+    flown.tracked = False
+    assert flown.fly(10.0, lambda t: PULL_M_S * (8.0 + t)) == []
+    assert not flown.used[-1][1]
+
+
 def test_while_they_are_doubted_the_autopilots_own_estimate_is_not_used() -> None:
     """It follows its receiver; without one it goes on by other sensors."""
     pulled, _ = faulty(circle, off=lambda _: np.array([30.0, -40.0, 0.0]))
@@ -296,7 +373,7 @@ def test_while_they_are_doubted_the_autopilots_own_estimate_is_not_used() -> Non
 
 
 def test_each_verdict_has_words_for_the_pilot() -> None:
-    for what in [each.value for each in Doubt] + [USED_AGAIN]:
+    for what in [each.value for each in Doubt] + [USED_AGAIN, WITHDRAWN]:
         assert what in OF_WARNING
-        assert doubts(Warned(0, what)) is (what != USED_AGAIN)
+        assert doubts(Warned(0, what)) is (what not in (USED_AGAIN, WITHDRAWN))
     assert doubts(Warned(0, "the camera has gone")) is None
