@@ -251,7 +251,10 @@ class LocalisationStage:
                 yield from said
             if self._gimbal is None and self._lens.watches:
                 with self._times("lens"):
-                    said = self._lens.end(self._tracker.view_of(frame.seq), self._tracker.map)
+                    said = self._lens.end(
+                        self._tracker.view_of(frame.seq), self._tracker.map,
+                        self._attitude.correction[0],
+                    )  # fmt: skip
                 yield from said
             yield self._frame_tracked(frame.t_ns, frame.seq, has_picture=True)
         yield from self._flow.of(frame)

@@ -8,7 +8,7 @@ import numpy as np
 
 from companion.estimation.lens.focal_length import Rays, focal_ratio, turn_across_rad
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array
+from companion.geometry.transforms import Array, angle_between
 from companion.messages import Warned
 from companion.slam.features.view import View
 from companion.slam.map.sparse_map import SlamMap
@@ -22,6 +22,8 @@ N_KNOWN, MAX_PAIRS = 20, 300
 NOTICED, SIGMAS, SURE_SIGMA = 0.04, 4.0, 0.012
 """Difference that is said, with so many standard deviations, which must be small themselves. Over
 level ground, where a turn looks much as a way does, half of what it is off by comes out."""
+MOUNT_RAD = SURE_SIGMA
+"""A mount that was off by more tells turns about other axes than images show."""
 ROUNDS, CAUCHY = 10, 2.0
 
 
@@ -44,14 +46,23 @@ class LensWatch:
 
     def __init__(self, camera: Camera) -> None:
         self._focal_px = camera.focal_px
+        self._mount: Array | None = None
         self._map: SlamMap | None = None
         self._start: _Start | None = None
         self._pairs: list[tuple[float, float]] = []
         self.watches = True
         """False once the focal length is known: nothing that comes later would be said."""
 
-    def end(self, view: View | None, slam_map: SlamMap) -> list[Warned]:
-        """Compare what was seen in a frame, if it was tracked; what is to be said."""
+    def end(self, view: View | None, slam_map: SlamMap, body_from_camera: Array) -> list[Warned]:
+        """Compare what was seen in a frame, if it was tracked; what is to be said.
+
+        Where the mount (3, 3) has been corrected since, turns so far do not count.
+        """
+        before, self._mount = self._mount, body_from_camera
+        if before is not None and angle_between(before, body_from_camera) > MOUNT_RAD:
+            self._start = None
+            self._pairs.clear()
+            return []
         if not self.watches or view is None:
             return []
         n_before = len(self._pairs)
