@@ -99,7 +99,8 @@ class Bootstrap:
             reference.features, features, ia, ib, focal_px, seq + 1, attitudes,
             self._min_parallax_rad,
         )  # fmt: skip
-        if result is None:
+        third = middle_view(self.pending, reference, view)
+        if result is None or third_view_rejects(third, reference, view, result):
             return None
         # the map: axes by the first view's attitude, unit length its median depth
         unit = 1.0 / float(np.median(result.points_a[:, 2]))
@@ -110,11 +111,6 @@ class Bootstrap:
         b_from_a = Pose(result.b_from_a.rotation, result.b_from_a.translation * unit)
         view.camera_from_map = b_from_a @ reference.camera_from_map
         points_map = result.points_a * unit @ map_rotation.T
-        third = middle_view(self.pending, reference, view)
-        if third is not None and third_view_rejects(
-            third, reference, view, points_map, result.features_a
-        ):
-            return None
         return TwoViewReconstruction(
             reference, view, points_map, result.features_a, result.features_b
         )

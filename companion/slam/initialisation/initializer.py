@@ -6,7 +6,7 @@ relative rotation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,34 +27,47 @@ HYPOTHESIS_INLIER_RATIO = 0.6
 """Hypotheses with fewer inliers than this ratio of the best do not compete."""
 MIN_COST_RATIO = 1.15
 """Cost of any competing hypothesis relative to the best, for that to be unambiguous."""
+PLAUSIBLE_COST = 3.0
+"""Cost per match under which a competing hypothesis may be the true one all the same. Two views
+leave one degree of freedom per match, so that the truth costs 1 by the noise that is stated. Lens,
+rolling shutter and wrong matches may cost twice as much again, which a wrong motion can absorb."""
 MAX_DIRECTION_SIGMA_RAD, TURNING_RAD = np.radians(3.0), np.radians(2.0)
 """Largest standard deviation of the direction of motion of a map that begins while the camera turns
 by so much between its two views. Where it hardly turns, the next frames see the same ground from
-further away and put the map right. Without attitude a plane never gives that certainty, and the
-hypotheses have competed."""
+further away and put the map right."""
+MAX_FREE_DIRECTION_SIGMA_RAD = np.radians(6.0)
+"""The same without attitude, where every turn is found by the same matches; the flattest ground
+gives that once views are a few degrees apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoViewGeometry:
-    """Two-view geometry: `b_from_a` with a unit baseline, points (N, 3) in a."""
+    """Two-view geometry: `b_from_a` with a unit baseline, points (N, 3) in a.
+
+    `competing` are other geometries of the same matches that explain them well enough to be true.
+    """
 
     b_from_a: Pose
     points_a: Array
     features_a: Ints
     features_b: Ints
+    competing: tuple[TwoViewGeometry, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Matches:
     """Ideal coordinates (N, 2) of matched features, their whitening (N, 2, 2), and the prior.
 
-    `rotation_prior` is the rotation `b_from_a` by the autopilot, where measured.
+    `index_a` and `index_b` (N,) are the features; `rotation_prior` is the rotation `b_from_a` by
+    the autopilot, where measured.
     """
 
     xa: Array
     xb: Array
     whitening_a: Array
     whitening_b: Array
+    index_a: Ints
+    index_b: Ints
     rotation_prior: Array | None
 
     def triangulated(self, pose: Pose) -> tuple[Array, Array]:
@@ -78,7 +91,7 @@ def initialise(
     attitudes: tuple[Array, Array] | None,
     min_parallax_rad: float,
 ) -> TwoViewGeometry | None:
-    """Relative pose and points from matches `index_a`, `index_b`; None when ambiguous.
+    """Relative pose and points from matches `index_a`, `index_b`; None when they cannot tell it.
 
     `attitudes` are `ned_from_camera` of a and b, where measured.
     """
@@ -87,25 +100,27 @@ def initialise(
     rotation_prior = None if attitudes is None else attitudes[1].T @ attitudes[0]
     matches = _Matches(
         a.normalised[index_a], b.normalised[index_b], a.whitening[index_a], b.whitening[index_b],
-        rotation_prior,
+        index_a, index_b, rotation_prior,
     )  # fmt: skip
     rotation_only = _explained_by_rotation(matches, focal_px)
     if np.mean(rotation_only) > MAX_PURE_ROTATION_RATIO:
         return None
     candidates = motion_hypotheses(matches.xa, matches.xb, focal_px, seed, attitudes)
-    best = _best(candidates, matches)
-    if best is None:
+    likely = _likely(candidates, matches)
+    if not likely:
         return None
-    found = _refined(best, matches, min_parallax_rad)
+    found = _refined(likely[0], matches, min_parallax_rad)
     if found is None:
         return None
-    pose, points, agree, shown = found
+    pose, agree = found
     # outliers fit no rotation either, but are known only now; with no prior the hypotheses competed
     if rotation_prior is not None and np.sum(rotation_only) > MAX_PURE_ROTATION_RATIO * np.sum(
         rotation_only | agree
     ):
         return None
-    return TwoViewGeometry(pose, points[shown], index_a[shown], index_b[shown])
+    shown_rad = min(0.3 * min_parallax_rad, float(np.radians(0.3)))
+    competing = tuple(_geometry(other, matches, shown_rad) for other in likely[1:])
+    return replace(_geometry(pose, matches, shown_rad), competing=competing)
 
 
 def _explained_by_rotation(matches: _Matches, focal_px: float) -> Bools:
@@ -144,16 +159,17 @@ def _unit_rays(normalised: Array) -> Array:
     return out
 
 
-def _best(candidates: list[Pose], matches: _Matches) -> Pose | None:
+def _likely(candidates: list[Pose], matches: _Matches) -> list[Pose]:
+    """The most likely pose, then those that may be true in its place; none if it is uncertain."""
     scored = []
     for pose in candidates:
         scored.append((int(np.sum(_squared_errors(pose, matches) < 2 * GAMMA)), pose))
     if not scored:
-        return None
+        return []
     scored.sort(key=lambda s: -s[0])
-    top, pose = scored[0]
+    top = scored[0][0]
     if top < MIN_POINTS // 2:
-        return None
+        return []
     competing = [p for n, p in scored if n > HYPOTHESIS_INLIER_RATIO * top]
     if matches.rotation_prior is not None:
         factor = _rotation_factor(matches.rotation_prior)
@@ -162,33 +178,34 @@ def _best(candidates: list[Pose], matches: _Matches) -> Pose | None:
             _, off = factor.errors(np.stack([np.eye(3), pose.rotation]))
             return _unexplained(pose, matches) + float(off[0]) ** 2
 
-        return min(competing, key=cost)
-    return _most_likely(competing, matches)
+        return [min(competing, key=cost)]
+    return _likely_without_attitude(competing, matches)
 
 
-def _most_likely(poses: list[Pose], matches: _Matches) -> Pose | None:
-    """The pose of least cost, each refined first; None if another is nearly as good."""
-    best: list[tuple[float, Pose]] = []
+def _likely_without_attitude(poses: list[Pose], matches: _Matches) -> list[Pose]:
+    """Poses by cost, each refined first; none if another is nearly as good as the first."""
+    ranked: list[tuple[float, Pose]] = []
     for start in poses:
         pose: Pose | None = start
         for limit in (16.0, 9.0):
             if pose is not None:
                 pose = _adjusted(pose, matches, limit)
-        if pose is None:
-            continue
-        best.append((_unexplained(pose, matches), pose))
-    if not best:
-        return None
-    best.sort(key=lambda c: c[0])
-    cost, pose = best[0]
-    for other, competitor in best[1:]:
-        different = (
-            angle_between(competitor.rotation, pose.rotation) > np.radians(1.5)
-            or float(competitor.translation @ pose.translation) < 0.95
-        )
-        if different and other < MIN_COST_RATIO * cost + 30.0:
-            return None
-    return pose
+        if pose is not None:
+            ranked.append((_unexplained(pose, matches), pose))
+    if not ranked:
+        return []
+    ranked.sort(key=lambda c: c[0])
+    cost, pose = ranked[0]
+    others = [
+        (other, competitor)
+        for other, competitor in ranked[1:]
+        if angle_between(competitor.rotation, pose.rotation) > np.radians(1.5)
+        or float(competitor.translation @ pose.translation) < 0.95
+    ]
+    if any(other < MIN_COST_RATIO * cost + 30.0 for other, _ in others):
+        return []
+    plausible = PLAUSIBLE_COST * len(matches.xa)
+    return [pose, *(competitor for other, competitor in others if other < plausible)]
 
 
 def _rotation_factor(rotation_prior: Array) -> RelativeRotationFactor:
@@ -249,10 +266,8 @@ def _adjusted(pose: Pose, matches: _Matches, limit: float) -> Pose | None:
     return Pose(adjusted.poses[0].rotation, adjusted.poses[0].translation * scale)
 
 
-def _refined(
-    pose: Pose, matches: _Matches, min_parallax_rad: float
-) -> tuple[Pose, Array, Bools, Bools] | None:
-    """Pose, points (N, 3), masks of inliers and of those with parallax."""
+def _refined(pose: Pose, matches: _Matches, min_parallax_rad: float) -> tuple[Pose, Bools] | None:
+    """Pose, and the mask of inliers."""
     for limit in (16.0, 5.991):
         adjusted = _adjusted(pose, matches, limit)
         if adjusted is None:
@@ -265,17 +280,27 @@ def _refined(
     parallax = float(np.arccos(np.clip(np.quantile(cosine[ok], 0.3), -1, 1)))
     if parallax < min_parallax_rad or not _direction_certain(pose, matches, ok):
         return None
-    shown = ok & (cosine < np.cos(min(0.3 * min_parallax_rad, np.radians(0.3))))
-    return pose, points, ok, shown
+    return pose, ok
+
+
+def _geometry(pose: Pose, matches: _Matches, shown_rad: float) -> TwoViewGeometry:
+    """The geometry of a pose, of the matches that agree and have more parallax than `shown_rad`."""
+    points, cosine = matches.triangulated(pose)
+    shown = matches.consistent(points, pose, GAMMA) & (cosine < np.cos(shown_rad))
+    return TwoViewGeometry(pose, points[shown], matches.index_a[shown], matches.index_b[shown])
 
 
 def _direction_certain(pose: Pose, matches: _Matches, ok: Bools) -> bool:
-    """True if the direction of motion is known well enough for a map that begins in a turn."""
-    prior = matches.rotation_prior
-    if prior is None or angle_between(prior, np.eye(3)) < float(TURNING_RAD):
-        return True
+    """True if the direction of motion is known well enough for a map."""
+    prior, prior_sigma_rad = matches.rotation_prior, None
+    max_sigma_rad = float(MAX_FREE_DIRECTION_SIGMA_RAD)
+    if prior is not None:
+        if angle_between(prior, np.eye(3)) < float(TURNING_RAD):
+            return True
+        prior_sigma_rad = float(_rotation_factor(prior).sigma_rad[0])
+        max_sigma_rad = float(MAX_DIRECTION_SIGMA_RAD)
     sigma_rad = direction_sigma_rad(
         pose, matches.xa[ok], matches.xb[ok], matches.whitening_a[ok], matches.whitening_b[ok],
-        float(_rotation_factor(prior).sigma_rad[0]),
+        prior_sigma_rad,
     )  # fmt: skip
-    return sigma_rad <= float(MAX_DIRECTION_SIGMA_RAD)
+    return sigma_rad <= max_sigma_rad

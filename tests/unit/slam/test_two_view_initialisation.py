@@ -87,3 +87,22 @@ def test_no_turn_is_seen_in_a_forward_flight(seed: int, way_m: float) -> None:
 
 def test_a_forward_flight_begins() -> None:
     assert all(flown_forward(4.0, seed) is not None for seed in range(5))
+
+
+def stepped_aside(way_m: float, seed: int) -> TwoViewGeometry | None:
+    """A step aside, seen in the middle of the picture, where it looks like a turn."""
+    rng = np.random.default_rng(seed)
+    n = 120
+    seen_a, depth = rng.uniform(-0.15, 0.15, (n, 2)), rng.uniform(8.0, 14.0, n)
+    points_b = np.c_[seen_a, np.ones(n)] * depth[:, None] - [way_m, 0.0, 0.0]
+    seen_b = points_b[:, :2] / points_b[:, 2:]
+    seen_a, seen_b = (s + rng.normal(scale=0.7 / FOCAL_PX, size=s.shape) for s in (seen_a, seen_b))
+    index = np.arange(n)
+    return initialise(
+        features(seen_a), features(seen_b), index, index, FOCAL_PX, seed, None, np.radians(1.0)
+    )
+
+
+def test_direction_must_be_certain_without_attitude() -> None:
+    assert all(stepped_aside(0.3, seed) is None for seed in range(6))
+    assert any(stepped_aside(1.2, seed) is not None for seed in range(6))
