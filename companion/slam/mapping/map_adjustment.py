@@ -187,12 +187,12 @@ def _remove_outliers(
 def partition(slam_map: SlamMap) -> Iterator[tuple[list[Keyframe], list[Keyframe], Bools]]:
     """Variable keyframes, fixed keyframes and point mask of each problem of a global adjustment.
 
-    The first two keyframes fix the gauge, or those of an earlier flight. A long flight is adjusted
-    in overlapping windows, each held by covisible keyframes.
+    The first keyframe is held, or those of an earlier flight; the damping holds the scale. A long
+    flight is adjusted in overlapping windows, each held by covisible keyframes.
     """
     ordered = sorted(slam_map.keyframes.values(), key=lambda k: k.keyframe_id)
-    held = [k for k in ordered if k.keyframe_id in slam_map.held] or ordered[:2]
-    free = [k for k in ordered[2:] if k.keyframe_id not in slam_map.held]
+    held = [k for k in ordered if k.keyframe_id in slam_map.held] or ordered[:1]
+    free = [k for k in ordered[1:] if k.keyframe_id not in slam_map.held]
     if not free:
         return
     if len(ordered) <= MAX_VARIABLE:

@@ -154,7 +154,11 @@ class Mapper:
         self.adjust_locally(keyframe)
 
     def adjust_locally(self, keyframe: Keyframe) -> None:
-        """Local bundle adjustment over a keyframe, its most covisible ones and all their points."""
+        """Local bundle adjustment over a keyframe, its most covisible ones and all their points.
+
+        Two held keyframes give a part of the map the scale of the rest. Where it is the whole map,
+        the damping holds the scale: a second one would hold the error of the two-view geometry.
+        """
         slam_map = self._map
         _, points = slam_map.observations_of(keyframe)
         ranked = [slam_map.keyframes[k] for _, k in slam_map.covisible(points, 15)]
@@ -180,7 +184,7 @@ class Mapper:
             fixed, variable = variable[:2], variable[2:]
             if not variable:
                 return
-        elif len(fixed) == 1 and len(variable) > 1:
+        elif len(fixed) == 1 and 1 < len(variable) < len(slam_map.keyframes) - 1:
             variable.sort(key=lambda k: k.keyframe_id)
             fixed, variable = [*fixed, variable[0]], variable[1:]
         self._adjust(variable, fixed, mask)
