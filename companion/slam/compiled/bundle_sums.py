@@ -5,10 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from companion.geometry.transforms import Array
-from companion.slam.compiled.compiling import Ints, compiled, integer, integers, matrices, pairs
+from companion.slam.compiled.compiling import (
+    Ints,
+    compiled,
+    integer,
+    integers,
+    matrices,
+    number,
+    pairs,
+)
 from companion.slam.compiled.pose_sums import HUBER
 
 _BEHIND_COST = HUBER * 100.0
+_LEAST = 1e-9
+"""Added to the information of what nothing observes, which then has an inverse."""
 
 
 @compiled(matrices, pairs, pairs, integers, integers, pairs, matrices)
@@ -96,6 +106,29 @@ def normal_equations(
             for m in range(3):
                 hcp[o, k, m] = a * jp[0, m] + b * jp[1, m]
     return hcc, gc, hpp, gp, hcp
+
+
+@compiled(matrices, number)
+def damped_inverses(information: Array, damping: float) -> Array:
+    """Inverses (P, 3, 3) of point information whose diagonals are damped, by L D L^T."""
+    out = np.empty(information.shape)
+    for i in range(len(information)):
+        a = information[i]
+        d_0 = a[0, 0] + (damping * a[0, 0] + _LEAST)
+        by_10, by_20 = a[1, 0] / d_0, a[2, 0] / d_0
+        d_1 = a[1, 1] + (damping * a[1, 1] + _LEAST) - by_10 * a[1, 0]
+        left = a[2, 1] - by_20 * a[1, 0]
+        by_21 = left / d_1
+        d_2 = a[2, 2] + (damping * a[2, 2] + _LEAST) - by_20 * a[2, 0] - by_21 * left
+        back = by_10 * by_21 - by_20  # first column of the inverse of L, last row
+        w_0, w_1, w_2 = 1.0 / d_0, 1.0 / d_1, 1.0 / d_2
+        out[i, 0, 0] = w_0 + by_10 * by_10 * w_1 + back * back * w_2
+        out[i, 0, 1] = out[i, 1, 0] = -by_10 * w_1 - back * by_21 * w_2
+        out[i, 0, 2] = out[i, 2, 0] = back * w_2
+        out[i, 1, 1] = w_1 + by_21 * by_21 * w_2
+        out[i, 1, 2] = out[i, 2, 1] = -by_21 * w_2
+        out[i, 2, 2] = w_2
+    return out
 
 
 @compiled(matrices, pairs, matrices, integers, integers, integers, integer)

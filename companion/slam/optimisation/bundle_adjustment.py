@@ -15,6 +15,7 @@ from scipy.linalg import solve_triangular
 from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from companion.slam.compiled.bundle_sums import (
     back_substitute,
+    damped_inverses,
     errors,
     normal_equations,
     schur_complement,
@@ -75,22 +76,19 @@ def adjust(
                 rotation, p, residual, b.camera, b.point, b.whitening, n_var, n_points
             )
         yield_point()
-        damped = hpp + (damping * np.einsum("nii->ni", hpp) + 1e-9)[..., None] * np.eye(3)
-        inverse = np.linalg.inv(damped)
+        inverse = damped_inverses(hpp, damping)
         yield_point()
         schur, rhs = schur_complement(inverse, gp, hcp, b.camera, b.point, by_point, n_var)
         yield_point()
         np.negative(schur, schur)
-        for k in range(n_var):
-            block = schur[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
-            block += hcc[k] + np.diag(damping * np.diag(hcc[k]) + 1e-9)
+        blocks, each = schur.reshape(n_var, 6, n_var, 6), np.arange(n_var)
+        more = damping * np.einsum("nii->ni", hcc) + 1e-9
+        blocks[each, :, each] += hcc + more[..., None] * np.eye(6)
         gradient = gc.copy()
         for factor in b.factors:
-            factor.add_normal_equations(
-                schur.reshape(n_var, 6, n_var, 6), gradient, rotation, translation
-            )
+            factor.add_normal_equations(blocks, gradient, rotation, translation)
         steps = _solved(schur, rhs - gradient.ravel())
-        del schur  # 72 MB for 500 keyframes, which the next one needs beside its own
+        del schur, blocks  # 72 MB for 500 keyframes, which the next one needs beside its own
         if steps is None:
             damping *= 10
             accepted = False

@@ -10,6 +10,7 @@ import pytest
 from companion.geometry.transforms import Array, rotation_from_vector
 from companion.slam.compiled.bundle_sums import (
     back_substitute,
+    damped_inverses,
     errors,
     normal_equations,
     schur_complement,
@@ -148,6 +149,20 @@ def test_schur_complement_and_back_substitution_match_the_dense_solution(scene: 
     np.testing.assert_allclose(
         moved.ravel(), blocks @ (-gp.ravel() - ties.T @ moves.ravel()), rtol=1e-9, atol=1e-9
     )
+
+
+def test_damped_inverses_are_those_of_points_hardly_and_never_observed() -> None:
+    """Of a direction that is known a thousand times worse than another, and of no information."""
+    rng = np.random.default_rng(3)
+    seen = rng.normal(size=(40, 6, 3)) * np.array([1e3, 3e2, 1.0])
+    turned = seen @ np.linalg.qr(rng.normal(size=(40, 3, 3)))[0]
+    information = np.concatenate([turned.transpose(0, 2, 1) @ turned, np.zeros((1, 3, 3))])
+    damped = information + np.stack(
+        [np.diag(0.01 * np.diag(each) + 1e-9) for each in information]
+    )  # fmt: skip
+    found = damped_inverses(information, 0.01)
+    np.testing.assert_array_equal(found, found.transpose(0, 2, 1))
+    np.testing.assert_allclose(found @ damped, np.tile(np.eye(3), (41, 1, 1)), atol=1e-10)
 
 
 def test_no_observations_give_zero_sums() -> None:
