@@ -64,15 +64,18 @@ class InOrder:
                     start = self._server.start
                     self._processes[stage.name] = LosslessProcess(stage, start, say)
         try:
+            for process in self._processes.values():
+                process.begin(setup)
             for stage in self._stages:
                 if stage.name in self._processes:
-                    self._processes[stage.name].begin(setup)
                     continue
                 work = self.works[stage.name] = module_of(stage.name).work(setup)
                 if stage.name == DEPTH:
                     self._thread = StageThread(stage.name, work, tell)
                 else:
                     work.begin(tell)
+            for process in self._processes.values():
+                process.wait_until_up()
         except BaseException:
             self._end_processes()
             raise

@@ -27,8 +27,11 @@ class LosslessProcess:
         )
 
     def begin(self, setup: Setup) -> None:
-        """Wait until it has begun; what it raises is raised."""
+        """Let it begin."""
         self._process.begin(setup)
+
+    def wait_until_up(self) -> None:
+        """Wait until it has begun; what it raises is raised."""
         self._process.up_or_gone.wait()
         if self.fault is not None:
             raise self.fault

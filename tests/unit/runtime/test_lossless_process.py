@@ -129,8 +129,9 @@ def test_what_it_raises_is_raised_here_after_what_was_given_before(
 
 
 def test_one_that_cannot_begin_raises_as_it_begins(tiny: LosslessProcess) -> None:
+    tiny.begin(Setup(Config(), CAMERA, Path(UNUSABLE), is_live=False))
     with pytest.raises(InputError, match="cannot be used"):
-        tiny.begin(Setup(Config(), CAMERA, Path(UNUSABLE), is_live=False))
+        tiny.wait_until_up()
 
 
 def test_a_driver_that_crashes_ends_the_process_alone(tiny: LosslessProcess) -> None:
