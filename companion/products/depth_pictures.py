@@ -17,7 +17,7 @@ PNG_LEVEL = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthPicture:
-    """Image of a keyframe (JPEG) and its depth in colours (PNG, transparent where invalid).
+    """Image of a keyframe (JPEG) and its depth in colours (H, W, 4), BGRA, clear where invalid.
 
     Colours run from `near` to `far`, in units of the keyframe's camera frame.
     """
@@ -25,11 +25,16 @@ class DepthPicture:
     keyframe_id: int
     t_ns: int
     image_jpeg: bytes
-    depth_png: bytes
+    colours: Bytes
     near: float
     far: float
     share_known: float
     n_updates: int
+
+    def depth_png(self) -> bytes:
+        """The depth's colours as PNG, which takes long: most pictures are never shown."""
+        options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
+        return cv2.imencode(".png", self.colours, options)[1].tobytes()
 
 
 class DepthPictures:
@@ -60,7 +65,7 @@ class DepthPictures:
 
 
 def picture_of(depth_map: DepthMap) -> DepthPicture:
-    """Encode a depth map, near red and far blue; needs at least one valid pixel."""
+    """Picture of a depth map, near red and far blue; needs at least one valid pixel."""
     known = depth_map.depth > 0
     near, far = (float(v) for v in np.percentile(depth_map.depth[known], [2, 98]))
     _, jpeg = cv2.imencode(
@@ -69,9 +74,8 @@ def picture_of(depth_map: DepthMap) -> DepthPicture:
         [cv2.IMWRITE_JPEG_QUALITY, 80],
     )
     coloured = _at_width(depth_colours(depth_map.depth, near, far), cv2.INTER_NEAREST)
-    _, png = cv2.imencode(".png", coloured, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
     return DepthPicture(
-        depth_map.keyframe_id, depth_map.t_ns, jpeg.tobytes(), png.tobytes(), near, far,
+        depth_map.keyframe_id, depth_map.t_ns, jpeg.tobytes(), coloured, near, far,
         float(known.mean()), depth_map.n_updates,
     )  # fmt: skip
 

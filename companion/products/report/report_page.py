@@ -186,7 +186,7 @@ def _depths(result: FlightResult) -> list[dict[str, Any]]:
         out.append(
             {
                 "image": _data("image/jpeg", picture.image_jpeg),
-                "depth": _data("image/png", picture.depth_png),
+                "depth": _data("image/png", picture.depth_png()),
                 "t_s": (picture.t_ns - (result.first_t_ns or 0)) * 1e-9,
                 "near": picture.near * scale,
                 "far": picture.far * scale,
