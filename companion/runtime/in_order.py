@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from companion.errors import CompanionError
@@ -51,6 +52,9 @@ class InOrder:
         """Thread of depth, if it has no process."""
         self._processes: dict[str, LosslessProcess] = {}
         self._server: ForkServer | None = None
+        self._closer = ThreadPoolExecutor(1, "parcels")
+        self._closed: dict[int, Future[Parcel]] = {}
+        """Frames to come, closed for the processes, by their number."""
 
         def tell(told: Any) -> None:
             if isinstance(told, Remark):
@@ -116,6 +120,8 @@ class InOrder:
                 if not isinstance(message, Frame):
                     continue
                 n_frames += 1
+                if self._processes:
+                    self._closed[message.seq] = self._closer.submit(Parcel.of, message)
                 for stage in self._stages:
                     if isinstance(message, stage.listens) and stage.name in self.works:
                         self.works[stage.name].look_ahead(message)
@@ -179,13 +185,17 @@ class InOrder:
             if not isinstance(message, stage.listens):
                 continue
             if stage.name in self._processes:
-                parcel = parcel or Parcel.of(message)
+                parcel = parcel or self._parcel_of(message)
                 self._processes[stage.name].put(parcel)
                 self._check(stage.name)
             elif stage.name == DEPTH and self._thread is not None:
                 self._thread.put(message)
             else:
                 self._publish(self.works[stage.name].step(message))
+
+    def _parcel_of(self, message: Message) -> Parcel:
+        closed = self._closed.pop(message.seq, None) if isinstance(message, Frame) else None
+        return Parcel.of(message) if closed is None else closed.result()
 
     def _publish(self, messages: Iterable[Any]) -> None:
         for message in messages:
@@ -204,6 +214,7 @@ class InOrder:
             self._pass(Warned(self._t_ns, DEPTH_FAILED, in_words(fault)))
 
     def _end_processes(self) -> None:
+        self._closer.shutdown(cancel_futures=True)
         for process in self._processes.values():
             process.kill()
         if self._server is not None:
