@@ -34,24 +34,27 @@ def displacement_factor(
     """
     if placed.sigma_scale > MAX_SIGMA_SCALE:
         return None
-    whole = _displacements(georeferencer, placed, everywhere)
+    rotation, translation = _poses(everywhere)
+    whole = _displacements(georeferencer, placed, everywhere, rotation)
     if whole is None:
         return None
-    error = typical_error(whole, *_poses(everywhere))
-    factor = None if error is None else _displacements(georeferencer, placed, keyframes)
-    if factor is None or error is None:
+    error = typical_error(whole, rotation, translation)
+    if error is None:
+        return None
+    factor = _displacements(georeferencer, placed, keyframes, _poses(keyframes)[0])
+    if factor is None:
         return None
     return replace(factor, sigma_m=CORRELATION_INFLATION * factor.sigma_m * max(error, 1.0))
 
 
 def _displacements(
-    georeferencer: Georeferencer, placed: Georeference, keyframes: list[Keyframe]
+    georeferencer: Georeferencer, placed: Georeference, keyframes: list[Keyframe], rotation: Array
 ) -> DisplacementFactor | None:
     t_ns = np.array([k.t_ns for k in keyframes])
     travelled_m = georeferencer.path.integrated_velocity(t_ns)
     if travelled_m is None:
         return None
-    to_world, (rotation, _) = placed.world_from_map, _poses(keyframes)
+    to_world = placed.world_from_map
     ned_from_camera = to_world.rotation @ rotation.transpose(0, 2, 1)
     where_m = travelled_m + georeferencer.lever_ned(ned_from_camera)
     order = np.argsort(t_ns, kind="stable")
