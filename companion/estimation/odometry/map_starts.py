@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from companion.estimation.body.reckoning import CONTRADICTS_SIGMAS
-from companion.estimation.odometry.odometry_course import MAX_SIGMA_SCALE_AIDING, OdometryCourse
+from companion.estimation.odometry.odometry_course import OdometryCourse
 from companion.estimation.odometry.odometry_frame import MapView, OdometryState
 from companion.estimation.odometry.placed_map import PlacedMap, frame_of
 from companion.estimation.odometry.stand import Stand
@@ -37,9 +37,10 @@ class MapStarts:
         course = self._course
         reckoned, last = course.reckoning.reckoned, course.flown.last
         goes_on = reckoned is not None or course.given
-        if goes_on and georeference.sigma_scale > MAX_SIGMA_SCALE_AIDING:
-            return False  # it would also be slower and faster than the body
-        if first is not None and track.t_ns - first.t_ns < YOUNG_NS and course.reckoning.is_good:
+        young = first is not None and track.t_ns - first.t_ns < YOUNG_NS
+        rough = goes_on and course.rough(georeference.sigma_scale)
+        good = course.reckoning.is_good
+        if (young and (good or rough)) or (rough and (good or reckoned is None)):
             return False
         placed = PlacedMap(segment, georeference, course.flown.camera_from_body)
         start = frame_of(

@@ -16,7 +16,8 @@ from companion.messages import Georeference, Odometry, Track, TrackState
 
 FLOOR_M, FLOOR_RAD = 0.02, float(np.radians(0.3))
 MAX_SIGMA_SCALE_AIDING = 0.05
-"""Of a map that aids inertial navigation: with a worse scale it would give a wrong velocity."""
+"""Of a map that aids inertial navigation which is good: with a worse scale it would give a wrong
+velocity. Of one that is not, a worse map bounds the errors, by ten per cent of the way."""
 SIGMA_ATTITUDE_RAD = float(np.radians(1.0))
 """Of the autopilot's attitude over some seconds."""
 
@@ -31,11 +32,17 @@ class OdometryCourse:
         self.body = body
         self.reckoning = Reckoning(body)
         self.velocity: Array = np.zeros(3)
+        self.aided_sigma_scale = 0.0
+        """Of the map that aided inertial navigation last, when it did."""
         self.dead_reckoning = False
         """True while the map does not give the poses."""
         self.given = False
         """True once a pose was given out."""
         self.reset_counter = 0
+
+    def rough(self, sigma_scale: float) -> bool:
+        """True for a scale that navigation should not go by, unless it goes by such a one."""
+        return sigma_scale > MAX_SIGMA_SCALE_AIDING >= self.aided_sigma_scale
 
     def reset(self) -> None:
         """Begin poses that are unrelated to those before."""
@@ -68,8 +75,7 @@ class OdometryCourse:
         placed = Pose(self.reckoning.rotation(attitude), reckoned.place_m)
         self.velocity, self.dead_reckoning = reckoned.velocity_m_s, True
         georeference, slewed_m = self.flown.georeference, self.flown.frame.slewed_m
-        sigma_scale = 0.0 if georeference is None else georeference.sigma_scale
-        sigma_scale = min(sigma_scale, MAX_SIGMA_SCALE_AIDING)  # with a worse one it has not aided
+        sigma_scale = self.aided_sigma_scale
         self.flown.hold(track.t_ns, placed, reckoned.sigma_place_m)
         drift = self.drift.add(track.t_ns, placed.translation, sigma_scale, slewed_m)
         return Odometry(

@@ -21,7 +21,6 @@ from companion.estimation.odometry.map_starts import MapStarts
 from companion.estimation.odometry.odometry_course import (
     FLOOR_M,
     FLOOR_RAD,
-    MAX_SIGMA_SCALE_AIDING,
     OdometryCourse,
 )
 from companion.estimation.odometry.odometry_frame import MapView, OdometryState, drift_m
@@ -163,7 +162,7 @@ class SmoothOdometry:
             if reckoned is not None:
                 return course.reckoned(track)
             return course.dead_reckoned(track, pose, raw, georeference)
-        poor = quality < self._least_quality or georeference.sigma_scale > MAX_SIGMA_SCALE_AIDING
+        poor = quality < self._least_quality or course.rough(georeference.sigma_scale)
         if poor and self.reckoning.is_good:
             return course.reckoned(track)
         fair = reckoned is not None and reckoned.sigma_place_m < FAIR_SIGMA_M
@@ -226,17 +225,18 @@ class SmoothOdometry:
         )  # fmt: skip
 
     def _aid(self, t_ns: int, placed: Pose, georeference: Georeference, noise_m: float) -> None:
-        """Aid inertial navigation by a tracked pose of the body, where the map's scale is good."""
-        attitude = self.reckoning.attitude
-        if attitude is not None and georeference.sigma_scale < MAX_SIGMA_SCALE_AIDING:
+        """Aid inertial navigation by a tracked pose, unless it is better than the map's scale."""
+        attitude, sigma_scale = self.reckoning.attitude, georeference.sigma_scale
+        worse = self.reckoning.reckoned is not None and not self.reckoning.is_good
+        if attitude is not None and (worse or not self._course.rough(sigma_scale)):
             turned = placed.rotation @ attitude.ned_from_body.T
             active = self._course.flown.placed
             segment = None if active is None else active.segment
             self._course.body.aid(AidedPlace(
                 attitude.t_ns, placed.translation, turned, noise_m,
-                georeference.sigma_scale if segment != self._aided_by else None,
+                sigma_scale if segment != self._aided_by else None,
             ))  # fmt: skip
-            self._aided_by = segment
+            self._aided_by, self._course.aided_sigma_scale = segment, sigma_scale
             self.ground.map_aided(t_ns)
 
     def _stands(self, t_ns: int, placed: Pose) -> bool:

@@ -373,3 +373,21 @@ def test_after_lift_off_a_heading_that_swings_is_followed_to_its_mean() -> None:
         found = vehicle.frame(np.zeros(3), heading_rad=settles_rad + swing_rad)
     assert found.world_from_body is not None
     assert yaw_angle(found.world_from_body.rotation) == pytest.approx(settles_rad, abs=0.01)
+
+
+def test_a_rough_map_is_flown_on_where_dead_reckoning_is_worse() -> None:
+    """Once it is two seconds old: another that was left may be seen again, and young ones bend."""
+    vehicle = Vehicle()
+    vehicle.frames(20, HERE)
+    lost = vehicle.frames(60)
+    assert lost.inertial and lost.sigma_position_m > 0.6
+    rough, first = replace(PLACED, sigma_scale=0.08), MapView(vehicle.t_ns, Pose.identity())
+    found = [
+        vehicle.frame(np.zeros(3), segment=5, georeference=rough, first=first) for _ in range(40)
+    ]
+    assert all(each.inertial for each in found[:18])
+    assert all(each.state is TrackState.TRACKING for each in found[22:])
+    assert found[-1].sigma_scale == rough.sigma_scale and found[-1].reset_counter == 0
+    again = vehicle.frame()
+    assert again.inertial and again.sigma_scale == rough.sigma_scale
+    assert again.sigma_position_m < lost.sigma_position_m
