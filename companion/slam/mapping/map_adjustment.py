@@ -184,15 +184,22 @@ def _remove_outliers(
     slam_map.clear_dead_observations(problem.keyframes)
 
 
+def is_without_attitude(slam_map: SlamMap) -> bool:
+    """Whether the keyframes of a map have no attitude."""
+    return not any(k.ned_from_camera is not None for k in slam_map.keyframes.values())
+
+
 def partition(slam_map: SlamMap) -> Iterator[tuple[list[Keyframe], list[Keyframe], Bools]]:
     """Variable keyframes, fixed keyframes and point mask of each problem of a global adjustment.
 
-    The first keyframe is held, or those of an earlier flight; the damping holds the scale. A long
-    flight is adjusted in overlapping windows, each held by covisible keyframes.
+    The first two keyframes are held, or those of an earlier flight; the first alone where no
+    attitude is known (`Mapper.adjust_locally`). A long flight is adjusted in overlapping windows,
+    each held by covisible keyframes.
     """
     ordered = sorted(slam_map.keyframes.values(), key=lambda k: k.keyframe_id)
-    held = [k for k in ordered if k.keyframe_id in slam_map.held] or ordered[:1]
-    free = [k for k in ordered[1:] if k.keyframe_id not in slam_map.held]
+    n_held = 1 if is_without_attitude(slam_map) else 2
+    held = [k for k in ordered if k.keyframe_id in slam_map.held] or ordered[:n_held]
+    free = [k for k in ordered[n_held:] if k.keyframe_id not in slam_map.held]
     if not free:
         return
     if len(ordered) <= MAX_VARIABLE:

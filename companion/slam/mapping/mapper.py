@@ -21,6 +21,7 @@ from companion.slam.mapping.map_adjustment import (
     apply_result,
     apply_result_later,
     build_problem,
+    is_without_attitude,
     no_displacements,
     partition,
 )
@@ -157,7 +158,9 @@ class Mapper:
         """Local bundle adjustment over a keyframe, its most covisible ones and all their points.
 
         Two held keyframes give a part of the map the scale of the rest. Where it is the whole map,
-        the damping holds the scale: a second one would hold the error of the two-view geometry.
+        a second one also holds the error of the two-view geometry, which is large without attitude:
+        the damping alone holds the scale then. With attitude metres may be measured by the map,
+        whose pose a drift of the scale would move at once.
         """
         slam_map = self._map
         _, points = slam_map.observations_of(keyframe)
@@ -184,7 +187,10 @@ class Mapper:
             fixed, variable = variable[:2], variable[2:]
             if not variable:
                 return
-        elif len(fixed) == 1 and 1 < len(variable) < len(slam_map.keyframes) - 1:
+        elif (
+            len(fixed) == 1 and len(variable) > 1
+            and not (is_without_attitude(slam_map) and len(variable) == len(slam_map.keyframes) - 1)
+        ):  # fmt: skip
             variable.sort(key=lambda k: k.keyframe_id)
             fixed, variable = [*fixed, variable[0]], variable[1:]
         self._adjust(variable, fixed, mask)
