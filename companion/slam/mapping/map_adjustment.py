@@ -185,7 +185,7 @@ def _remove_outliers(
 
 
 def is_without_attitude(slam_map: SlamMap) -> bool:
-    """Whether the keyframes of a map have no attitude."""
+    """True where no keyframe of a map has an attitude."""
     return not any(k.ned_from_camera is not None for k in slam_map.keyframes.values())
 
 
