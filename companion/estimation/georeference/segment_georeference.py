@@ -139,11 +139,13 @@ class SegmentGeoreferences:
     def update(self, segments: Sequence[SlamMap], t_ns: int, final: bool) -> MapUpdate:
         """The map with all segments in the frame of the main one."""
         self._revision += 1
+        due = self.stale(t_ns) or any(map(_due, segments[-1:]))
+        if due:  # of a map that is held, too, which nothing is to be solved for
+            self._solved_ns = t_ns
         for segment in segments:
             if segment.first_keyframe_id in self._held:
                 continue
-            if final or (segment is segments[-1] and (_due(segment) or self.stale(t_ns))):
-                self._solved_ns = t_ns
+            if final or (segment is segments[-1] and due):
                 found = self._georeferencer.solve(
                     self._samples.of(
                         segment,
