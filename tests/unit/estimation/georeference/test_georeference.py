@@ -11,7 +11,13 @@ from companion.config import GeoreferenceConfig
 from companion.estimation.georeference.alignment_sample import AlignmentSample
 from companion.estimation.georeference.georeferencer import Georeferencer, place_new_map
 from companion.estimation.georeference.trajectory_alignment import Scale
-from companion.geometry.transforms import Pose, Similarity, rotation_from_vector, yaw_rotation
+from companion.geometry.transforms import (
+    Array,
+    Pose,
+    Similarity,
+    rotation_from_vector,
+    yaw_rotation,
+)
 from companion.telemetry import HeightSample, PositionSample, PositionSource, RangeSample
 
 TRUTH = Similarity(
@@ -140,12 +146,18 @@ def test_rangefinder_gives_scale_without_position() -> None:
     assert found.world_from_map.scale == pytest.approx(TRUTH.scale, rel=0.01)
 
 
-def test_barometer_gives_scale_of_a_climb() -> None:
-    kept, ned = places()
+def by_barometer(ned: Array) -> Georeferencer:
+    """One that has barometric heights of places (N, 3), two a second, and nothing else."""
     georeferencer = Georeferencer(GeoreferenceConfig(), None)
     for i in range(400):
         down = np.interp(i * 0.1, np.arange(len(ned)) * 0.5, ned[:, 2])
         georeferencer.take(HeightSample(T0 + i * 100_000_000, 400.0 - down))
+    return georeferencer
+
+
+def test_barometer_gives_scale_of_a_climb() -> None:
+    kept, ned = places()
+    georeferencer = by_barometer(ned)
     found = georeferencer.solve(kept)
     assert found is not None
     assert found.method == "barometric height"
@@ -154,10 +166,7 @@ def test_barometer_gives_scale_of_a_climb() -> None:
 
 def test_barometer_and_accelerometers_know_a_scale_better_than_either() -> None:
     kept, ned = places()
-    georeferencer = Georeferencer(GeoreferenceConfig(), None)
-    for i in range(400):
-        down = np.interp(i * 0.1, np.arange(len(ned)) * 0.5, ned[:, 2])
-        georeferencer.take(HeightSample(T0 + i * 100_000_000, 400.0 - down))
+    georeferencer = by_barometer(ned)
     alone = georeferencer.solve(kept)
     inertial = Scale(1.1 * TRUTH.scale, 0.06, "accelerometers", 50)
     both = georeferencer.solve(kept, inertial)
