@@ -72,7 +72,7 @@ class SegmentGeoreferences:
 
     def stale(self, t_ns: int) -> bool:
         """True where they wait for a keyframe, and frames have told more meanwhile."""
-        return t_ns - self._solved_ns > SETTLED_NS
+        return t_ns - self._solved_ns > SETTLED_NS and self._places.newest_ns > self._solved_ns
 
     def of(self, segment: SlamMap) -> Georeference | None:
         """Georeference of a segment; None until known."""
@@ -214,7 +214,7 @@ class SegmentGeoreferences:
         whole = final and self._acceleration.believed
         settled_ns = max(newest[-min(SETTLED_AFTER, len(newest))], t_ns - SETTLED_NS)
         until_ns = newest[-1] + 1 if whole else settled_ns
-        since_ns = 0 if whole else until_ns - estimate.window_ns
+        since_ns = 0 if whole else self._places.since_ns(until_ns, estimate.window_ns)
         places = self._places.of(table, segment.unit_of, turned, since_ns, until_ns)
         if whole:
             return settled(places, self._acceleration, lever_m, turned, delay_ns, start)

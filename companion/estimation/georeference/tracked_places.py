@@ -13,6 +13,10 @@ from companion.geometry.transforms import Array, Pose
 
 SPACING_NS = 45_000_000
 """Frames closer than this see the same features, with the same errors."""
+HOVER_NS = 10_000_000_000
+"""Frames by one keyframe for longer are of a hover. They tell no scale: what a map's places err by is
+not white there, and 90 s of it in a firmware's simulator told a scale 16 % too small, to 3 %."""
+PAUSE_NS = 1_000_000_000
 MAX_PLACES = 8192
 """Six minutes at 20 a second, 2 MB; the older half goes when they are full."""
 
@@ -41,7 +45,7 @@ class TrackedPlaces:
     """Keeps frames of all maps relative to their keyframes; the last ones, of a bounded number."""
 
     def __init__(self) -> None:
-        self._n = 0
+        self._n = self._hover_from_ns = 0
         self._t_ns = np.zeros(256, np.int64)
         self._keyframe = np.zeros(256, np.int64)
         self._rows = np.zeros((256, 21))
@@ -50,8 +54,12 @@ class TrackedPlaces:
     def add(
         self, t_ns: int, keyframe_id: int, keyframe_from_camera: Pose, ned_from_body: Array
     ) -> None:
-        """Add a frame; one too close to the last is left out."""
-        if self._n and abs(t_ns - int(self._t_ns[self._n - 1])) < SPACING_NS:
+        """Add a frame; one too close to the last, or of a hover, is left out."""
+        if self._n and abs(t_ns - self.newest_ns) < SPACING_NS:
+            return
+        if not self._n or keyframe_id != self._keyframe[self._n - 1]:
+            self._hover_from_ns = t_ns + HOVER_NS
+        if t_ns > self._hover_from_ns:
             return
         if self._n == MAX_PLACES:
             half = MAX_PLACES // 2
@@ -68,6 +76,20 @@ class TrackedPlaces:
             [pose.rotation.ravel(), pose.translation, ned_from_body.ravel()]
         )
         self._n += 1
+
+    @property
+    def newest_ns(self) -> int:
+        """Time of the last frame that was added; 0 before the first."""
+        return int(self._t_ns[self._n - 1]) if self._n else 0
+
+    def since_ns(self, until_ns: int, lasting_ns: int) -> int:
+        """Time since which frames until another time last so long, without pauses between them."""
+        t_ns, since_ns = self._t_ns[: self._n], until_ns - lasting_ns
+        for n in np.flatnonzero(np.diff(t_ns) > PAUSE_NS)[::-1]:
+            if t_ns[n + 1] <= since_ns:
+                break
+            since_ns -= int(t_ns[n + 1] - t_ns[n])
+        return since_ns
 
     def of(
         self, table: PoseTable, unit_of: Mapping[int, float], body_from_camera: Array,

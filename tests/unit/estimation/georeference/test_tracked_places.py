@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.estimation.georeference.tracked_places import MAX_PLACES, TrackedPlaces
+from companion.estimation.georeference.tracked_places import (
+    HOVER_NS,
+    MAX_PLACES,
+    TrackedPlaces,
+)
 from companion.geometry.pose_table import PoseTable
 from companion.geometry.transforms import Pose, rotation_from_vector
 
@@ -52,3 +56,20 @@ def test_their_number_is_bounded() -> None:
     found = kept.of(table, {}, np.eye(3), 0, 2**62)
     assert MAX_PLACES // 2 <= len(found.t_ns) <= MAX_PLACES
     assert found.t_ns[-1] == (2 * MAX_PLACES + 4) * STEP_NS
+
+
+def test_a_hover_does_not_count() -> None:
+    """Nor does it push what was flown before it out of a time that frames are to last."""
+    kept, pose, flown_ns = TrackedPlaces(), Pose.identity(), 20 * STEP_NS
+    for t_ns in range(0, flown_ns, STEP_NS):
+        kept.add(t_ns, 1 + t_ns // (5 * STEP_NS), pose, np.eye(3))
+    for t_ns in range(flown_ns, flown_ns + 30 * HOVER_NS, STEP_NS):
+        kept.add(t_ns, 9, pose, np.eye(3))
+    hovered_ns = kept.newest_ns
+    assert hovered_ns == flown_ns + HOVER_NS
+    again_ns = flown_ns + 30 * HOVER_NS
+    for t_ns in range(again_ns, again_ns + flown_ns, STEP_NS):
+        kept.add(t_ns, 10, pose, np.eye(3))
+    lasting_ns = flown_ns + 2 * STEP_NS
+    assert kept.since_ns(again_ns + flown_ns, lasting_ns) == hovered_ns - 2 * STEP_NS
+    assert kept.since_ns(again_ns + flown_ns, flown_ns - STEP_NS) == again_ns + STEP_NS
