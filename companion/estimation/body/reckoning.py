@@ -17,6 +17,9 @@ CONTRADICTS_SIGMAS = 4.0
 without aid in the firmwares' simulators was 2.5 of them at most."""
 GOOD_SIGMA_M = 0.5
 """As long as it is this certain, it counts for more than a map that is poor."""
+FAIR_SIGMA_M = 1.0
+"""As long as it is this certain, it is sent, and counts for more than a map that may not have been
+found, or whose scale is too uncertain to be sent."""
 
 
 class BodyAttitude(NamedTuple):
@@ -57,6 +60,11 @@ class Reckoning:
     def is_good(self) -> bool:
         """True where it counts for more than a map that is poor."""
         return self.reckoned is not None and self.reckoned.sigma_place_m < GOOD_SIGMA_M
+
+    @property
+    def is_fair(self) -> bool:
+        """True where it counts for more than a map that may be wrong."""
+        return self.reckoned is not None and self.reckoned.sigma_place_m < FAIR_SIGMA_M
 
     def may_be_at(self, place_m: Array) -> bool:
         """True where it may be off by the distance to a place (3,)."""

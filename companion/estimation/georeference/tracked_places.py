@@ -14,8 +14,8 @@ from companion.geometry.transforms import Array, Pose
 SPACING_NS = 45_000_000
 """Frames closer than this see the same features, with the same errors."""
 HOVER_NS = 10_000_000_000
-"""Frames by one keyframe for longer are of a hover. They tell no scale: what a map's places err by is
-not white there, and 90 s of it in a firmware's simulator told a scale 16 % too small, to 3 %."""
+"""Frames by one keyframe for longer are of a hover. They tell no scale: what a map's places err by
+is not white there, and 90 s of it in a firmware's simulator told a scale 16 % too small, to 3 %."""
 PAUSE_NS = 1_000_000_000
 MAX_PLACES = 8192
 """Six minutes at 20 a second, 2 MB; the older half goes when they are full."""

@@ -39,8 +39,9 @@ class MapStarts:
         goes_on = reckoned is not None or course.given
         young = first is not None and track.t_ns - first.t_ns < YOUNG_NS
         rough = goes_on and course.rough(georeference.sigma_scale)
-        good = course.reckoning.is_good
-        if (young and (good or rough)) or (rough and (good or reckoned is None)):
+        if young and (rough or course.reckoning.is_good):
+            return False
+        if rough and (course.reckoning.is_fair or reckoned is None):
             return False
         placed = PlacedMap(segment, georeference, course.flown.camera_from_body)
         start = frame_of(

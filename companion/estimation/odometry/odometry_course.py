@@ -16,8 +16,9 @@ from companion.messages import Georeference, Odometry, Track, TrackState
 
 FLOOR_M, FLOOR_RAD = 0.02, float(np.radians(0.3))
 MAX_SIGMA_SCALE_AIDING = 0.05
-"""Of a map that aids inertial navigation which is good: with a worse scale it would give a wrong
-velocity. Of one that is not, a worse map bounds the errors, by ten per cent of the way."""
+"""Of a map that aids inertial navigation which is fair: with a worse scale it would give a wrong
+velocity, and is not sent. Of one that is not, a worse map bounds the errors, by ten per cent of the
+way."""
 SIGMA_ATTITUDE_RAD = float(np.radians(1.0))
 """Of the autopilot's attitude over some seconds."""
 

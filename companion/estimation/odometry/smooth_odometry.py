@@ -34,8 +34,6 @@ from companion.messages import Georeference, Odometry, Track, TrackState
 QUALITY_MARGIN = 1.5
 """Below this, times the least quality that is sent, good inertial navigation counts for more: a
 vehicle that turns on the spot sees new ground without parallax."""
-FAIR_SIGMA_M = 1.0
-"""As long as it is this certain, it counts for more than a map that may not have been found."""
 SIGMA_DOUBTED_M, SIGMA_DOUBTED_M_S = 0.1, 0.1
 """At least, of inertial navigation that a wrong map has aided."""
 LEAST_GONE_M, STANDS_RATIO = 0.25, 0.3
@@ -162,11 +160,10 @@ class SmoothOdometry:
             if reckoned is not None:
                 return course.reckoned(track)
             return course.dead_reckoned(track, pose, raw, georeference)
-        poor = quality < self._least_quality or course.rough(georeference.sigma_scale)
-        if poor and self.reckoning.is_good:
-            return course.reckoned(track)
-        fair = reckoned is not None and reckoned.sigma_place_m < FAIR_SIGMA_M
-        if not self.found_again.certain and fair:
+        doubtful = course.rough(georeference.sigma_scale) or not self.found_again.certain
+        if (doubtful and self.reckoning.is_fair) or (
+            quality < self._least_quality and self.reckoning.is_good
+        ):
             return course.reckoned(track)
         attitude = self.reckoning.attitude
         image_m = track.sigma_position * georeference.world_from_map.scale
@@ -227,7 +224,7 @@ class SmoothOdometry:
     def _aid(self, t_ns: int, placed: Pose, georeference: Georeference, noise_m: float) -> None:
         """Aid inertial navigation by a tracked pose, unless it is better than the map's scale."""
         attitude, sigma_scale = self.reckoning.attitude, georeference.sigma_scale
-        worse = self.reckoning.reckoned is not None and not self.reckoning.is_good
+        worse = self.reckoning.reckoned is not None and not self.reckoning.is_fair
         if attitude is not None and (worse or not self._course.rough(sigma_scale)):
             turned = placed.rotation @ attitude.ned_from_body.T
             active = self._course.flown.placed

@@ -380,7 +380,7 @@ def test_a_rough_map_is_flown_on_where_dead_reckoning_is_worse() -> None:
     vehicle = Vehicle()
     vehicle.frames(20, HERE)
     lost = vehicle.frames(60)
-    assert lost.inertial and lost.sigma_position_m > 0.6
+    assert lost.inertial and lost.sigma_position_m > 1.0
     rough, first = replace(PLACED, sigma_scale=0.08), MapView(vehicle.t_ns, Pose.identity())
     found = [
         vehicle.frame(np.zeros(3), segment=5, georeference=rough, first=first) for _ in range(40)
@@ -391,3 +391,16 @@ def test_a_rough_map_is_flown_on_where_dead_reckoning_is_worse() -> None:
     again = vehicle.frame()
     assert again.inertial and again.sigma_scale == rough.sigma_scale
     assert again.sigma_position_m < lost.sigma_position_m
+
+
+def test_dead_reckoning_that_can_be_sent_goes_on_in_a_rough_map() -> None:
+    """Another, or the one that was flown on: no pose by its scale would be sent."""
+    vehicle = Vehicle()
+    vehicle.frames(20, HERE)
+    lost = vehicle.frames(40)
+    assert lost.inertial and 0.5 < lost.sigma_position_m < 0.9
+    rough = replace(PLACED, sigma_scale=0.08)
+    first = MapView(vehicle.t_ns - 3 * 10**9, Pose.identity())
+    for segment in (5, 0):
+        found = vehicle.frame(HERE, segment=segment, georeference=rough, first=first)
+        assert found.inertial and found.sigma_scale < 0.05
