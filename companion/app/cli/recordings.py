@@ -231,8 +231,11 @@ def _add_flights(commands: Any) -> None:
     mission.add_argument(
         "--back", action="store_true", help="the way back: from the end to the beginning"
     )
-    for parser in (show, trim, export, mission):
+    for parser in (show, trim, export):
         parser.add_argument("flight", metavar="FLIGHT", help="name, folder or file")
+    mission.add_argument(
+        "flight", metavar="FLIGHT", help="name or folder of a flight, or what --out of a replay was"
+    )
     verify = does.add_parser(
         "verify", parents=[place], help="check all checksums",
         description="Check all checksums of recordings. Exit status 1 where one is damaged or cut "
