@@ -2,8 +2,11 @@
 
 import os
 
-# before rerun loads: that recordings have no list of their chunks is meant, see rrd_files
-os.environ.setdefault("RUST_LOG", "warn,re_log_encoding::rrd::file_sink=error")
+# before rerun loads: that recordings have no list of their chunks is meant, see rrd_files; that a
+# viewer went before the last was sent to it, as where Ctrl-C ends both, is no fault
+os.environ.setdefault(
+    "RUST_LOG", "warn,re_log_encoding::rrd::file_sink=error,re_sdk::recording_stream=off"
+)
 
 from companion.streaming.scene_encoder import Watched
 from companion.streaming.viewer.colours import Colours
