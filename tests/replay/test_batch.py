@@ -38,8 +38,8 @@ def test_an_archive_is_replayed_once_and_shown_on_one_page(tmp_path: Path) -> No
     flights = [tmp_path / FIRST, tmp_path / SECOND / "flight.mcap"]
     flights += [tmp_path / "empty", tmp_path / "short"]
     out = tmp_path / "out"
-    settings = "--out", out, "--workers", 2, "--set", "depth.enabled=false"
-    done = batch(*flights, *settings)
+    settings = "--out", out, "--set", "depth.enabled=false"
+    done = batch(*flights, *settings, "--workers", 2)
     assert done.returncode == 1
     lines = done.stderr.splitlines()
     assert len(lines) == 2 and lines[0].startswith("companion: empty: "), done.stderr

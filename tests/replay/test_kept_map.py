@@ -32,11 +32,9 @@ SECOND = 1_000_000_000
 BARE = ["--set", "depth.enabled=false"]
 
 
-@pytest.fixture(scope="module")
-def first(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    done = replay_here(SAMPLE, tmp_path_factory.mktemp("first"), "--stop", "14", *BARE)
-    assert done.status == 0, done.stderr
-    return done
+@pytest.fixture
+def first(sample_begun: Run) -> Run:
+    return sample_begun
 
 
 def test_it_goes_on_in_the_map_without_satellites(first: Run, tmp_path: Path) -> None:

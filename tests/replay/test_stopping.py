@@ -30,7 +30,15 @@ def test_results_so_far(tmp_path: Path, number: signal.Signals, status: int, den
     """Progress goes to a terminal of our own, which tells when the camera is tracked."""
     ours, theirs = os.openpty()
     process = subprocess.Popen(
-        [*COMMAND, "--out", str(tmp_path / "out"), "--set", f"depth.enabled={dense}"],
+        [
+            *COMMAND,
+            "--out",
+            str(tmp_path / "out"),
+            "--set",
+            f"depth.enabled={dense}",
+            "--set",
+            "expert.depth.stride=4",
+        ],
         stderr=theirs,
         stdout=subprocess.DEVNULL,
         env={**os.environ, "TERM": "xterm", "COLUMNS": "120"},

@@ -12,23 +12,19 @@ from tests.support.processes.program import Run, replay_here
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 METRIC_S = 14
-"""Time in which the flight gets its scale by positions, and poses are proven."""
+"""As long as `sample_begun`."""
 
 
-def replayed(out: Path, *settings: str) -> Run:
-    options = [part for each in ("depth.enabled=false", *settings) for part in ("--set", each)]
+def believing(out: Path, *words: str) -> Run:
+    options = "--set", "depth.enabled=false", "--set", f"telemetry.use={list(words)}"
     run = replay_here(SAMPLE, out, "--stop", str(METRIC_S), *options)
     assert run.status == 0, run.stderr
     return run
 
 
-def believing(out: Path, *words: str) -> Run:
-    return replayed(out, f"telemetry.use={list(words)}")
-
-
-@pytest.fixture(scope="module")
-def everything(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return replayed(tmp_path_factory.mktemp("everything"))
+@pytest.fixture
+def everything(sample_begun: Run) -> Run:
+    return sample_begun
 
 
 def test_everything_is_believed_and_nothing_said_of_it(everything: Run) -> None:
