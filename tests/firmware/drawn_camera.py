@@ -205,7 +205,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     camera = DrawnCamera(parser.parse_args(_southern(sys.argv[1:])))
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: camera.stop.set())
+        signal.signal(number, lambda *_: sys.exit())  # an Event may be locked by this thread
     threading.Thread(target=obey, args=(sys.stdin, camera), daemon=True).start()
     camera.run()
 
