@@ -53,11 +53,26 @@ class LiftOffHeading:
         """Time, and the autopilot's heading against ours as it was at the lift-off."""
         self._step: _Step | None = None
         self._turned_rad = 0.0
+        self._young: tuple[int, Array] | None = None
+        """Map that is not flown on yet, and the rotation (3, 3) ned_from_map of its first frame."""
 
     def lift_off(self, t_ns: int, reset_counter: int, place_m: Array) -> None:
         """Take the place (3,) of a lift-off, in the frame as it is between two resets."""
         self._last, self._before = _LiftOff(t_ns, reset_counter, place_m), None
-        self._step, self._turned_rad = None, 0.0
+        self._step, self._turned_rad, self._young = None, 0.0, None
+
+    def foresee(self, t_ns: int, segment: int, ned_from_map: Array) -> None:
+        """Take the attitude (3, 3) of a map that is too young to be flown on.
+
+        It will go on from its first view, with the heading of then.
+        """
+        if self._last is None:
+            return
+        if self._young is None or self._young[0] != segment:
+            self._young = segment, ned_from_map
+        off_rad = yaw_angle(ned_from_map @ self._young[1].T)
+        self._average(t_ns, off_rad, t_ns - self._last.t_ns < WITHIN_NS)
+        self._before = t_ns, off_rad
 
     def turned(
         self, frame: OdometryFrame, t_ns: int, world_from_body: Pose, ned_from_body: Array | None,

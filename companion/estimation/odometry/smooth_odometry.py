@@ -142,11 +142,16 @@ class SmoothOdometry:
         course, flown = self._course, self._course.flown
         pose, reckoned = track.map_from_camera, self.reckoning.reckoned
         known = track.state in (TrackState.TRACKING, TrackState.DEAD_RECKONING)
-        if not known or pose is None or georeference is None:
+        if not known or pose is None:
+            return course.reckoned(track)
+        attitude, active = self.reckoning.attitude, flown.placed
+        if attitude is not None and (active is None or segment != active.segment):
+            body_from_map = (pose.rotation @ flown.camera_from_body.rotation).T
+            self._heading.foresee(track.t_ns, segment, attitude.ned_from_body @ body_from_map)
+        if georeference is None:
             return course.reckoned(track)
         if flown.last is not None and track.t_ns <= flown.last.t_ns:
             return course.none(track)  # late: a pose without it was given meanwhile
-        active = flown.placed
         if active is None or segment != active.segment:
             if not self._starts.start(segment, georeference, track, pose, first):
                 return course.reckoned(track)
@@ -165,7 +170,6 @@ class SmoothOdometry:
             quality < self._least_quality and self.reckoning.is_good
         ):
             return course.reckoned(track)
-        attitude = self.reckoning.attitude
         image_m = track.sigma_position * georeference.world_from_map.scale
         noise_m = NOISE_INFLATION * image_m
         if self._stands(track.t_ns, flown.frame.from_world @ raw):
