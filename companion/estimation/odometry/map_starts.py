@@ -55,11 +55,14 @@ class MapStarts:
         ):  # fmt: skip
             return False
         self._stand.in_world |= georeference.has_origin
-        if not start.goes_on:
+        sigma_m = 0.0 if reckoned is None else reckoned.sigma_place_m
+        if start.goes_on and sigma_m < course.gate.max_jump_m:
+            course.drift.carry(sigma_m)
+        else:  # it jumps, or may have done so unseen
             course.reset_counter += course.given
             course.drift.clear()
-            if last is not None and georeference.has_origin:
-                course.body.reset()
+        if not start.goes_on and last is not None and georeference.has_origin:
+            course.body.reset()
         course.reckoning.path.clear()
         course.flown.begin(placed, start, pose)
         course.dead_reckoning = False
@@ -92,5 +95,7 @@ class MapStarts:
         if course.reckoning.reckoned is not None:
             expected = course.reckoning.reckoned.place_m
         correction = expected - (course.flown.frame.from_world @ raw).translation
-        if float(np.linalg.norm(correction)) < course.gate.max_jump_m:
+        off_m = float(np.linalg.norm(correction))
+        if off_m < course.gate.max_jump_m:
+            course.drift.carry(off_m / float(np.sqrt(3.0)))
             course.flown.frame = course.flown.frame.shifted(correction)

@@ -74,6 +74,15 @@ class OdometryDrift:
         self._new_share = float((born > self._newest_born).mean())
         self._newest_born = max(self._newest_born, int(born.max()))
 
+    def carry(self, sigma_m: float) -> None:
+        """Take the last position for uncertain by this on each axis, and what goes on from it.
+
+        A map that takes over from dead reckoning does not know better where the body went before.
+        """
+        if self._path:
+            last = self._path[-1]
+            self._path[-1] = last._replace(walked_m2=last.walked_m2 + sigma_m**2)
+
     def add(
         self, t_ns: int, position: Array, sigma_scale: float, slewed: Array, noise_m: float = 0.0
     ) -> Drift:

@@ -375,6 +375,40 @@ def test_after_lift_off_a_heading_that_swings_is_followed_to_its_mean() -> None:
     assert yaw_angle(found.world_from_body.rotation) == pytest.approx(settles_rad, abs=0.01)
 
 
+@pytest.mark.parametrize(("segment", "away_m"), [(5, 0.0), (0, 0.5)])
+def test_what_dead_reckoning_may_be_off_by_is_stated_of_the_map_that_takes_over(
+    segment: int, away_m: float
+) -> None:
+    """A new map knows nothing of the way before it; one that is seen again shows what it was."""
+    vehicle = Vehicle()
+    known = vehicle.frames(20, HERE)
+    blind = vehicle.frames(45)
+    assert blind.inertial and blind.sigma_position_m > 0.25
+    first = MapView(vehicle.t_ns, Pose.identity()) if segment else None
+    there_m = np.zeros(3) if segment else HERE + [away_m, 0.0, 0.0]
+    while (found := vehicle.frame(there_m, segment=segment, first=first)).inertial:
+        pass
+    assert found.reset_counter == 0
+    stated_m = away_m / np.sqrt(3.0) if away_m else blind.sigma_position_m
+    assert 0.9 * stated_m < found.sigma_position_m < 2.0 * stated_m
+    for _ in range(150):  # until that is longer ago than what is stated is of
+        last = vehicle.frame(there_m, segment=segment, first=first)
+    assert last.sigma_position_m < known.sigma_position_m + 0.02
+
+
+def test_a_map_is_a_reset_where_dead_reckoning_before_it_may_be_a_jump_off() -> None:
+    """Poses go on from its place, as certain as the map."""
+    vehicle = Vehicle()
+    vehicle.frames(20, HERE)
+    while (blind := vehicle.frame()).sigma_position_m < 1.2:
+        pass
+    first = MapView(vehicle.t_ns, Pose.identity())
+    found = vehicle.frame(np.zeros(3), segment=5, first=first)
+    assert not found.inertial and found.reset_counter == blind.reset_counter + 1
+    assert found.sigma_position_m < 0.1
+    np.testing.assert_allclose(place(found), place(blind), atol=0.05)
+
+
 def test_a_rough_map_is_flown_on_where_dead_reckoning_is_worse() -> None:
     """Once it is two seconds old: another that was left may be seen again, and young ones bend."""
     vehicle = Vehicle()
@@ -387,7 +421,7 @@ def test_a_rough_map_is_flown_on_where_dead_reckoning_is_worse() -> None:
     ]
     assert all(each.inertial for each in found[:18])
     assert all(each.state is TrackState.TRACKING for each in found[22:])
-    assert found[-1].sigma_scale == rough.sigma_scale and found[-1].reset_counter == 0
+    assert found[-1].sigma_scale == rough.sigma_scale
     again = vehicle.frame()
     assert again.inertial and again.sigma_scale == rough.sigma_scale
     assert again.sigma_position_m < lost.sigma_position_m
