@@ -16,9 +16,9 @@ from companion.flight_notes import GateStep, ObstaclePoints
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array
 from companion.messages import DepthMap, Frame, MapUpdate, PointChunk, Track
+from companion.obstacles.depth_points import obstacle_points
 from companion.obstacles.obstacle_finder import ObstacleFinder, Round
 from companion.obstacles.obstacle_sectors import FREE_M, MAX_M, Obstacles
-from companion.obstacles.recent_cloud import obstacle_points
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.measurements.obstacle_distance import obstacle_messages

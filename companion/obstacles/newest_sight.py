@@ -53,6 +53,12 @@ class Seen:
         away_m = self.rays_world[sure] / self.inverse_m[sure, None]
         return np.asarray(self.eye_world_m + away_m)
 
+    @property
+    def ends_world_m(self) -> Array:
+        """Up to where the rays of all (N, 3) surely meet nothing; a kilometre away at most."""
+        least_m = self.rays_world / np.maximum(self.most_inverse_m, 1e-3)[:, None]
+        return np.asarray(self.eye_world_m + least_m)
+
 
 class NewestSight:
     """Follows corners from image to image while the camera is located in a metric map."""

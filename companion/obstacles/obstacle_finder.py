@@ -14,7 +14,7 @@ import numpy as np
 
 from companion.flight_notes import ObstaclePoints
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, Pose
+from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import (
     Bytes,
     DepthMap,
@@ -38,12 +38,16 @@ from companion.obstacles.obstacle_sectors import (
     sector_of,
 )
 from companion.obstacles.obstacle_space import cells_with, nearest_in_cells
-from companion.obstacles.recent_cloud import RecentCloud
+from companion.obstacles.occupancy_grid import OccupancyGrid
 from companion.obstacles.sight_tracks import WINDOW_PX
 
 MAX_AGE_NS = 200_000_000
 """Age of the image that the pose is from, and of that in which a sector was seen, since exposure;
 beyond it nothing is known: at 5 m/s all distances are a metre off."""
+CELL_POINTS = 2
+"""Points for which an occupied cell counts, of `MIN_POINTS`: two in a sector are no outlier."""
+THINGS_NS = 1_000_000_000
+"""Age up to which a thing in an image stays: from farther away, its distance is known less well."""
 MOST_TRACKS = 16
 """Frames within that age, and more at 60 a second: every other is then enough."""
 MOST_WAITING = 4
@@ -73,7 +77,7 @@ class _Known:
     """Points around the vehicle, and what confirms them.
 
     That are keypoints of the newest frames, with `world_from_camera` of each, and things (M, 3) in
-    the newest image.
+    the newest images.
     """
 
     t_ns: int
@@ -96,13 +100,20 @@ class ObstacleFinder:
         self._tracks: deque[Track] = deque(maxlen=MOST_TRACKS)
         """The newest that found map points."""
         self._map: MapUpdate | None = None
-        self._cloud = RecentCloud()
+        self._forget()
         self._waiting: deque[DepthMap | PointChunk] = deque(maxlen=MOST_WAITING)
         self._n_taken = 0
         self._sight = NewestSight(camera)
         self._greys: deque[tuple[int, Bytes]] = deque(maxlen=MOST_TRACKS)
         """The newest images by their numbers: of one its track comes some images later."""
         self._sighted = -1
+
+    def _forget(self) -> None:
+        self._grid = OccupancyGrid()
+        self._things: deque[tuple[int, Array]] = deque(maxlen=MOST_TRACKS)
+        """In the newest images."""
+        self._anchor: tuple[int, Similarity] | None = None
+        """A keyframe near by, and where in the world it was at the look before."""
 
     def take(self, message: Track | MapUpdate | DepthMap | PointChunk) -> None:
         """Take a track, a map update, a depth map or points."""
@@ -137,9 +148,7 @@ class ObstacleFinder:
         one they are the nearest (N, 3) in each part of the space around, metres, in body axes: see
         `companion.obstacles.obstacle_space`.
         """
-        for part in parts:
-            self._cloud.add(part)
-        known = self._known(given)
+        known = self._known(given, parts)
         if known is None:
             return None
         return self._in_space(known) if reach_m is None else self._in_sectors(known, reach_m)
@@ -151,14 +160,11 @@ class ObstacleFinder:
             is_seen |= sectors_seen(
                 keypoints_px, world_from_camera, known.world_from_body, self._camera
             )
+        things = known.things_world_m - known.world_from_body.translation
+        is_seen[sector_of(things, known.world_from_body)] = True
         is_free = np.zeros(N_SECTORS, bool)
-        if known.newest is not None:
-            things = known.things_world_m - known.world_from_body.translation
-            around = sector_of(things, known.world_from_body)
-            is_seen |= np.bincount(around, minlength=N_SECTORS) > 0
-            if reach_m <= FREE_M:
-                window_rad = WINDOW_PX / self._camera.fx
-                is_free = free_sectors(known.newest, known.world_from_body, window_rad)
+        if known.newest is not None and reach_m <= FREE_M:
+            is_free = free_sectors(self._grid, known.newest, known.world_from_body)
         return known_in(
             obstacles_around(
                 known.t_ns, known.world_from_body, known.points_world_m, is_free, reach_m
@@ -174,22 +180,30 @@ class ObstacleFinder:
             is_seen |= cells_with(rays, pose)
         return nearest_in_cells(pose, known.points_world_m, is_seen)
 
-    def _known(self, given: Round) -> _Known | None:
+    def _known(self, given: Round, parts: Sequence[ObstaclePoints]) -> _Known | None:
         now_ns, track, update = given.t_ns, given.track, given.update
         if (
-            track is None or track.state is not TrackState.TRACKING
-            or track.map_from_camera is None or now_ns - track.t_ns > MAX_AGE_NS
+            track is None or track.map_from_camera is None
             or update is None or update.georeference is None
         ):  # fmt: skip
             return None
-        points = self._cloud.in_world(now_ns, update)
-        if points is None:
-            return None
         world_from_map = update.georeference.world_from_map
-        world_from_body = (
-            world_from_map.apply_to_pose(track.map_from_camera) @ self._camera.camera_from_body
-        )
+        world_from_camera = world_from_map.apply_to_pose(track.map_from_camera)
+        eye = world_from_camera.translation
+        self._follow_map(eye, track, update, world_from_map)
+        self._grid.move(eye, now_ns)
+        for part in parts:
+            place = update.place_of(part.keyframe_id)
+            if place is not None:
+                points_camera = part.points_camera.astype(np.float64)
+                self._grid.hit((world_from_map @ place).apply(points_camera))
+        if track.state is not TrackState.TRACKING or now_ns - track.t_ns > MAX_AGE_NS:
+            return None
+        if given.grey is not None and track.seq != self._sighted:
+            self._sighted = track.seq
+            self._look_at(track, given.grey, update)
         sights: list[tuple[Floats, Pose]] = []
+        points = [np.repeat(self._grid.occupied(), CELL_POINTS, 0)]
         for each in given.tracks:
             pose = each.map_from_camera
             if pose is None or each.keypoints_px is None or now_ns - each.t_ns > MAX_AGE_NS:
@@ -197,15 +211,44 @@ class ObstacleFinder:
             sights.append((each.keypoints_px, world_from_map.apply_to_pose(pose)))
             if each is track:
                 found = points_found(update.points_map, each.keypoints_px, pose, self._camera)
-                points = np.concatenate([points, world_from_map.apply(found)])
-        if given.grey is not None and track.seq != self._sighted:
-            self._sighted = track.seq
-            self._sight.add(track, given.grey, update)
-        newest, things = self._sight.newest, np.zeros((0, 3))
-        if newest is None or now_ns - newest.t_ns > MAX_AGE_NS:
+                points.append(world_from_map.apply(found))
+                self._grid.doubt(points[-1])
+        # one thing counts as enough of a sector: others near it have confirmed it
+        stay = [things for t_ns, things in self._things if now_ns - t_ns <= THINGS_NS]
+        points += [np.repeat(things, MIN_POINTS, 0) for things in stay]
+        now = [things for t_ns, things in self._things if now_ns - t_ns <= MAX_AGE_NS]
+        newest = self._sight.newest
+        if newest is not None and now_ns - newest.t_ns > MAX_AGE_NS:
             newest = None
-        else:
-            things = things_in(newest, 0.5 * WINDOW_PX / self._camera.fx)
-            # one counts as enough of a sector: others near it have confirmed it
-            points = np.concatenate([points, np.repeat(things, MIN_POINTS, 0)])
-        return _Known(track.t_ns, world_from_body, points, sights, newest, things)
+        return _Known(
+            track.t_ns, world_from_camera @ self._camera.camera_from_body, np.concatenate(points),
+            sights, newest, np.concatenate([np.zeros((0, 3)), *now]),
+        )  # fmt: skip
+
+    def _look_at(self, track: Track, grey: Bytes, update: MapUpdate) -> None:
+        """Take the newest image into the grid."""
+        self._sight.add(track, grey, update)
+        seen = self._sight.newest
+        if seen is None or seen.t_ns != track.t_ns:
+            return
+        things = things_in(seen, 0.5 * WINDOW_PX / self._camera.fx)
+        self._things.append((seen.t_ns, things))
+        self._grid.see_through(seen.eye_world_m, seen.ends_world_m)
+        self._grid.doubt(np.concatenate([seen.points_world_m, things]))
+
+    def _follow_map(
+        self, eye_world_m: Array, track: Track, update: MapUpdate, world_from_map: Similarity
+    ) -> None:
+        """Take how the map has moved in the world since the look before; of another, all anew."""
+        if self._anchor is not None:
+            keyframe_id, before = self._anchor
+            place = update.place_of(keyframe_id)
+            moved = None if place is None else world_from_map @ place @ before.inverse()
+            if moved is None or not self._grid.correct(eye_world_m, moved):
+                self._forget()
+            elif place is not None:
+                self._anchor = keyframe_id, world_from_map @ place
+        if track.keyframe_id is not None:
+            place = update.place_of(track.keyframe_id)
+            if place is not None:
+                self._anchor = track.keyframe_id, world_from_map @ place

@@ -24,6 +24,8 @@ MIN_POINTS = 3
 """Fewer points in a sector count as outliers."""
 MIN_M, MAX_M = 0.3, 20.0
 """Horizontal distances searched for obstacles; what is nearer is the vehicle itself."""
+FAR_M = 1000.0
+"""More than any distance: sectors and distances in them are sorted as one number."""
 FREE_M = 8.0
 """Distance up to which a sector is free; in straight flight more has no parallax ahead."""
 ABOVE_M, BELOW_M = 1.0, 0.75
@@ -60,24 +62,21 @@ def obstacles_around(
 
     The pose must be by the map of the points: a slewed one is offset.
     """
-    points = points_world_m[np.isfinite(points_world_m).all(1)] - world_from_body.translation
+    points = points_world_m - world_from_body.translation
+    # nan is in no band
+    points = points[(points[:, 2] >= -ABOVE_M) & (points[:, 2] <= BELOW_M)]
     distance_m = np.hypot(points[:, 0], points[:, 1])
-    sector = sector_of(points, world_from_body)
+    hit = (distance_m >= MIN_M) & (distance_m <= reach_m)
+    in_order = np.sort(FAR_M * sector_of(points[hit], world_from_body) + distance_m[hit])
+    found, first, n = np.unique(in_order // FAR_M, return_index=True, return_counts=True)
 
     max_cm = round(reach_m * 100)
     min_cm = round(MIN_M * 100)
     distances_cm = np.where(is_free, max_cm + 1, UNKNOWN_CM).astype(np.uint16)
-    down_m = points[:, 2]
-    hit = (down_m >= -ABOVE_M) & (down_m <= BELOW_M)
-    hit &= (distance_m >= MIN_M) & (distance_m <= reach_m)
-    hit_m, hit_sector = distance_m[hit], sector[hit]
-    order = np.lexsort((hit_m, hit_sector))
-    hit_m, hit_sector = hit_m[order], hit_sector[order]
-    found, first, n = np.unique(hit_sector, return_index=True, return_counts=True)
     # not the very nearest point of a sector, which may be an outlier
     enough = n >= MIN_POINTS
-    nearest_m = hit_m[first[enough] + MIN_POINTS - 1]
-    distances_cm[found[enough]] = np.clip((nearest_m * 100).astype(np.int64), min_cm, max_cm)
+    nearest_cm = 100 * (in_order[first[enough] + MIN_POINTS - 1] % FAR_M)
+    distances_cm[found[enough].astype(np.int64)] = np.clip(nearest_cm, min_cm, max_cm)
     return Obstacles(t_ns, distances_cm, min_cm, max_cm)
 
 

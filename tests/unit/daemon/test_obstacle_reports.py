@@ -32,7 +32,7 @@ from companion.messages import (
 )
 from companion.obstacles.obstacle_finder import MAX_AGE_NS, MOST_TRACKS
 from companion.obstacles.obstacle_sectors import FREE_M
-from companion.obstacles.recent_cloud import STAYS_S
+from companion.obstacles.occupancy_grid import DOUBT, FADES_NS, MOST
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.vehicle import Firmware, Vehicle
@@ -209,9 +209,10 @@ def test_distances_on_the_way_to_a_wall_and_a_pole() -> None:
 
 
 def test_an_obstacle_stays_for_a_while() -> None:
+    stays_s = 1e-9 * FADES_NS * (MOST - DOUBT)
     approach = Approach(wall_m=45.0, pole=(15, 2.2, 0.1))
     assert 0 < approach.fly(3.0)[3] < 2000  # the pole
-    assert 0 < approach.fly(STAYS_S - 3.0, 0.0)[3] < 2000
+    assert 0 < approach.fly(stays_s - 3.0, 0.0)[3] < 2000
     assert set(approach.fly(5.0, 0.0)) == {UNKNOWN}
 
 

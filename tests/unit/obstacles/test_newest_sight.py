@@ -30,15 +30,17 @@ def looked(
     pose_error_m: float = 0.0,
     camera: Camera = CAMERA,
     scene: ApproachScene = SCENE,
+    each: Callable[[Seen], None] = lambda seen: None,
+    n_images: int = 12,
 ) -> Seen | None:
-    """After twelve images; the poses told are off by so much across the way, and turned."""
+    """After so many images; the poses told are off by so much across the way, and turned."""
     rng = np.random.default_rng(3)
     sight = NewestSight(camera)
     update: Any = SimpleNamespace(
         georeference=SimpleNamespace(world_from_map=Similarity.identity()),
         place_of=lambda _: Similarity.identity(),
     )
-    for n in range(12):
+    for n in range(n_images):
         pose = Pose(np.eye(3), path(n)) @ AHEAD
         off = Pose(
             rotation_from_vector(rng.normal(0, 1e-3, 3)),
@@ -47,6 +49,8 @@ def looked(
         told = pose @ off if pose_error_m else pose
         track = Track(n, n, TrackState.TRACKING, told, 1, told)
         sight.add(track, scene.picture(camera, pose), update)
+        if sight.newest is not None:
+            each(sight.newest)
     return sight.newest
 
 

@@ -11,14 +11,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.geometry.transforms import (
     Array,
     Pose,
-    Similarity,
     quaternion_from_euler,
     rotation_from_quaternion,
-    rotation_from_vector,
 )
-from companion.messages import Georeference, MapUpdate, PointChunk
 from companion.obstacles.obstacle_sectors import N_SECTORS, UNKNOWN_CM, obstacles_around
-from companion.obstacles.recent_cloud import RecentCloud, obstacle_points
 from drivers.mavlink.measurements.obstacle_distance import obstacle_distance
 
 PLACE = np.array([103.0, -57.0, -12.0])
@@ -133,62 +129,3 @@ def test_message_is_as_autopilots_read_it() -> None:
     assert message.distances[0] == 2001
     assert message.distances[8] == pytest.approx(800, abs=4)
     assert set(message.distances) == {2001, message.distances[8], 65535}
-
-
-def chunk(keyframe_id: int, t_s: float, points: Array) -> PointChunk:
-    n = len(points)
-    return PointChunk(
-        keyframe_id,
-        round(t_s * 1e9),
-        points.astype(np.float32),
-        np.zeros((n, 3), np.uint8),
-        np.ones(n, np.float32),
-        np.zeros((n, 3), np.float32),
-        np.ones(n, np.float32),
-    )
-
-
-def map_update(world_from_map: Similarity | None) -> MapUpdate:
-    camera = Pose(rotation_from_vector(np.array([0.1, 0.4, -0.2])), np.array([1.0, 2.0, 3.0]))
-    georeference = (
-        None if world_from_map is None else Georeference(world_from_map, 0.01, 0.01, "", 9, 0.1)
-    )
-    return MapUpdate(1, 0, {5: camera}, np.zeros((0, 3)), georeference, {5: 0.5})
-
-
-def test_recent_cloud_follows_map_updates() -> None:
-    turn = rotation_from_vector(np.array([0.0, 0.0, 0.7]))
-    update = map_update(Similarity(4.0, turn, PLACE))
-    cloud = RecentCloud(max_age_s=10)
-    points = np.array([[0.5, 0.25, 2.0], [1.0, 0.0, 3.0]])
-    cloud.add(obstacle_points(chunk(5, 100, points)))
-    cloud.add(obstacle_points(chunk(6, 100, points)))  # of a keyframe that the map does not have
-    placed = cloud.in_world(105 * 10**9, update)
-    assert placed is not None
-    camera = update.map_from_camera[5]
-    wanted = 4.0 * (0.5 * points @ camera.rotation.T + camera.translation) @ turn.T + PLACE
-    np.testing.assert_allclose(placed, wanted, atol=1e-9)
-    old = cloud.in_world(111 * 10**9, update)
-    assert old is not None
-    assert len(old) == 0
-
-
-def test_without_a_scale_there_are_no_distances() -> None:
-    cloud = RecentCloud()
-    cloud.add(obstacle_points(chunk(5, 100, np.ones((5, 3)))))
-    assert cloud.in_world(100 * 10**9, map_update(None)) is None
-
-
-def test_recent_cloud_is_bounded() -> None:
-    cloud = RecentCloud(max_parts=3)
-    update = MapUpdate(
-        1, 0, {i: Pose.identity() for i in range(10)}, np.zeros((0, 3)),
-        Georeference(Similarity.identity(), 0.01, 0.01, "", 9, 0.1),
-    )  # fmt: skip
-    for i in range(10):
-        cloud.add(obstacle_points(chunk(i, 100 + i, np.full((950, 3), float(i))), 100))
-        cloud.add(obstacle_points(chunk(i, 100 + i, np.full((1050, 3), float(i))), 100))
-    placed = cloud.in_world(110 * 10**9, update)
-    assert placed is not None
-    assert sorted(set(placed[:, 0])) == [7, 8, 9]
-    assert len(placed) <= 300
