@@ -15,19 +15,21 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: opencl
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
 
-# First what only computes; then flights in real time, which wait more than they compute, three at a
-# time too; last what wants the computer for itself. Files in which one of these fails are run once
-# more, one after the other: a machine that others use too may be too busy for one, and in some files
-# one flight goes through all tests.
+# First what only computes; then flights in real time, one for each core, which take 0.8 of one
+# and more: three at once on two cores are all late, and take longer than one after the other; last
+# what wants the computer for itself. Files in which one of these fails are run once more, one
+# after the other: a machine that others use too may be too busy for one, and in some files one
+# flight goes through all tests.
 test: $(VENV)/.installed-dev opencl
 	$(MAKE) --no-print-directory --jobs=2 lint loops
-	$(BIN)/pytest -m "not real_time" --ignore tests/live --ignore tests/system $(THREE)
-	$(BIN)/pytest -m "real_time and not alone" tests/live $(REAL_TIME) $(THREE) || $(ONCE_MORE)
+	$(BIN)/pytest -m "not real_time" --ignore tests/live --ignore tests/system -n 3 $(IN_ORDER)
+	$(BIN)/pytest -m "real_time and not alone" tests/live $(REAL_TIME) -n $$(nproc) $(IN_ORDER) || \
+	  $(ONCE_MORE)
 	$(BIN)/pytest tests/system tests/firmware || $(ONCE_MORE)
 
 # In the order in which they are found, which is that of tests/conftest.py: the longest files first.
 # The slowest tests are named at the end.
-THREE = -n 3 --dist loadfile --no-loadscope-reorder --durations 60 --durations-min 2
+IN_ORDER = --dist loadfile --no-loadscope-reorder --durations 60 --durations-min 2
 # Files that are not asked for are not imported: that takes each worker six seconds and more.
 REAL_TIME = $(shell grep -rl --include='test_*.py' real_time tests/unit tests/replay)
 ONCE_MORE = { [ $$? -eq 1 ] && $(BIN)/pytest -m real_time $$($(FAILED_FILES)); }

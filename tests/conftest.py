@@ -17,6 +17,7 @@ import pytest
 
 from tests.support.left_behind import left_since, running, watch_tasks
 from tests.support.processes.steal import FlownAgain
+from tests.support.processes.turns import Turns
 
 LONGEST = (
     "test_two_nodes", "test_flown_by_vision", "test_as_flown", "test_set_up_in_browser",
@@ -33,6 +34,7 @@ MARKS = {"live": ("real_time",), "system": ("real_time", "alone")}
 
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(FlownAgain())
+    config.pluginmanager.register(Turns())
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -12,6 +12,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import CameraConfig, TelemetryConfig
@@ -95,6 +96,7 @@ def again(path: Path, out: Path, *options: str) -> tuple[Run, dict[str, Any]]:
     return done, found
 
 
+@pytest.mark.all_cores
 def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> None:
     """Of what was believed: what was not is in the recording as well."""
     path = flown(tmp_path)

@@ -19,7 +19,10 @@ from companion.daemon.periodic_checks import NO_PROGRESS
 from tests.support.processes.daemon_process import Daemon
 from tests.support.waiting import PATIENCE_S, until
 
-PATTERN = ("camera.source=pattern", "daemon.flight=always", "recorder.enabled=false")
+PATTERN = (
+    "camera.source=pattern", "camera.width=320", "camera.height=240", "camera.rate_hz=15",
+    "daemon.flight=always", "recorder.enabled=false",
+)  # fmt: skip
 
 
 class ServiceManager:

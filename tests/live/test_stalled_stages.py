@@ -45,7 +45,10 @@ def works(health: dict[str, Any], kind: str) -> bool:
 
 
 def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path) -> None:
-    settings = "camera.source=pattern", "camera.rate_hz=10", "depth.enabled=false", "link.url="
+    settings = (
+        "camera.source=pattern", "camera.width=320", "camera.height=240", "camera.rate_hz=10",
+        "depth.enabled=false", "link.url=",
+    )  # fmt: skip
     with Daemon(tmp_path, *settings, program=("-c", IMPATIENT)) as daemon:
         for kind in (*KINDS, "localisation"):
             daemon.until(partial(is_up, kind=kind, n_restarted=0), timeout_s=UP_S)
