@@ -122,7 +122,7 @@ class Approach:
         """Of each sector, each time: true distance of what stands there, what was told of it,
         metres, inf where farther than 20 m, nan where unknown, and whether it was free for PX4."""
         stages = [stage_named("localisation"), stage_named("depth")]
-        run = InOrder(stages, Setup(config, CAMERA), self._watch, print)
+        run = InOrder(stages, Setup(config, CAMERA, is_live=False), self._watch, print)
         seconds = (FIRST_M - LAST_M) / SPEED_M_S
         frames = (self._frame(n) for n in range(round(seconds * RATE_HZ)))
         for message in in_order_of_time(telemetry_of(self._place, seconds), frames):
