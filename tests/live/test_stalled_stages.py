@@ -52,6 +52,8 @@ def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path) -> None:
     with Daemon(tmp_path, *settings, program=("-c", IMPATIENT)) as daemon:
         for kind in (*KINDS, "localisation"):
             daemon.until(partial(is_up, kind=kind, n_restarted=0), timeout_s=UP_S)
+        for kind in KINDS:
+            daemon.until(partial(works, kind=kind), timeout_s=UP_S)
         stopped_ns = {kind: daemon.signal_stage(kind, signal.SIGSTOP) for kind in KINDS}
         n_poses = stage_of(daemon.status(), "localisation")["n"]
         for kind in KINDS:

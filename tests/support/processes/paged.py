@@ -10,8 +10,8 @@ The settings of camera and autopilot are in the file, where the page changes the
 from __future__ import annotations
 
 import signal
-import urllib.error
 import urllib.request
+from http.client import HTTPException
 from pathlib import Path
 
 from companion.page.codes import Codes, read_codes
@@ -81,7 +81,7 @@ class Paged(Flying):
         try:
             with urllib.request.urlopen(self.url, timeout=20):
                 return True
-        except (urllib.error.URLError, OSError):
+        except (OSError, HTTPException):  # a port that nobody has yet may be connected to itself
             return False
 
     def codes(self) -> Codes:
