@@ -246,8 +246,11 @@ class ObstacleFinder:
             moved = None if place is None else world_from_map @ place @ before.inverse()
             if moved is None or not self._grid.correct(eye_world_m, moved):
                 self._forget()
-            elif place is not None:
-                self._anchor = keyframe_id, world_from_map @ place
+            else:
+                for n, (t_ns, things_world_m) in enumerate(self._things):
+                    self._things[n] = t_ns, moved.apply(things_world_m)
+                if place is not None:
+                    self._anchor = keyframe_id, world_from_map @ place
         if track.keyframe_id is not None:
             place = update.place_of(track.keyframe_id)
             if place is not None:

@@ -13,6 +13,7 @@ from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, Similarity, rotation_from_vector
 from companion.messages import Track, TrackState
 from companion.obstacles.newest_sight import NewestSight, Seen, things_in
+from companion.obstacles.obstacle_finder import ObstacleFinder, Round
 from tests.support.flights.approach_scene import ApproachScene, Rod, Sheet
 
 AHEAD = Pose(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.zeros(3))
@@ -77,3 +78,27 @@ def test_without_a_way_nothing_is_known() -> None:
     seen = looked(lambda n: np.array([0.0, 0.0, -3.0]))
     assert seen is not None
     assert len(seen.points_world_m) == 0
+
+
+def test_what_is_seen_goes_with_a_correction_of_the_map() -> None:
+    finder = ObstacleFinder(CAMERA)
+
+    def points_in_view(n: int, shift_m: Array) -> Array:
+        pose = Pose(np.eye(3), np.array([0.0, 0.05 * n - 0.55, -3.0])) @ AHEAD
+        grey = SCENE.picture(CAMERA, pose)
+        track = Track(n, n, TrackState.TRACKING, pose, 1, pose)
+        world_from_map = Similarity(1.0, np.eye(3), shift_m)
+        update: Any = SimpleNamespace(
+            georeference=SimpleNamespace(world_from_map=world_from_map),
+            place_of=lambda _: Similarity.identity(),
+        )
+        found = finder.look(Round(n, track, (), update, grey, (), n), (), None)
+        assert isinstance(found, np.ndarray)
+        return found
+
+    for n in range(12):
+        before = points_in_view(n, np.zeros(3))
+    assert len(before)
+    assert np.allclose(before[:, :2], [6.0, 0.8], atol=0.3), "the pole"
+    # of the same image, which is looked at once
+    assert points_in_view(11, np.array([0.0, 4.0, 0.0])) == pytest.approx(before, abs=1e-6)
