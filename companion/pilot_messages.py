@@ -200,6 +200,7 @@ REASONS: Mapping[str, str] = {
     "position reset": "position reset",
     "no autopilot clock": "no clock",
     "another companion on the link": "second companion",
+    "the link is too slow": "link too slow",
     "disk is slow": "disk slow",
     "autopilot rebooted": "autopilot reboot",
 }

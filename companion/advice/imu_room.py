@@ -66,7 +66,7 @@ def imu_room(link: LinkConfig, bytes_per_s: float | None, firmware: str) -> ImuR
 
 def asked_bytes_per_s(link: LinkConfig) -> float:
     """Load by all that is asked for but the IMU."""
-    signature = _signature_bytes(link)
+    signature = signature_bytes(link)
     return (
         link.attitude_hz * (ATTITUDE_BYTES + signature)
         + link.position_hz * sum(each + signature for each in POSITION_BYTES)
@@ -80,8 +80,8 @@ def imu_bytes_per_s(link: LinkConfig, bytes_per_s: float, firmware: str) -> floa
     """Load by the IMU on a line of this capacity."""
     if link.imu_hz == "auto":
         room = imu_room(link, bytes_per_s, firmware)
-        return room.rate_hz * (IMU_BYTES[room.message] + _signature_bytes(link))
-    return link.imu_hz * (max(IMU_BYTES.values()) + _signature_bytes(link))
+        return room.rate_hz * (IMU_BYTES[room.message] + signature_bytes(link))
+    return link.imu_hz * (max(IMU_BYTES.values()) + signature_bytes(link))
 
 
 def in_whole_ms(rate_hz: float) -> float:
@@ -111,8 +111,9 @@ def check_loop_rate(values: Values, link: LinkConfig) -> list[Finding]:
 def _free_hz(link: LinkConfig, bytes_per_s: float, firmware: str, message: str) -> float:
     load = PX4_LOAD if firmware == PX4 else MAX_LOAD
     free = load * bytes_per_s - asked_bytes_per_s(link)
-    return free / (IMU_BYTES[message] + _signature_bytes(link))
+    return free / (IMU_BYTES[message] + signature_bytes(link))
 
 
-def _signature_bytes(link: LinkConfig) -> int:
+def signature_bytes(link: LinkConfig) -> int:
+    """By which each message is longer."""
     return SIGNATURE_BYTES if link.signing_key_file else 0

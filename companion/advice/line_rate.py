@@ -9,13 +9,19 @@ from companion.advice.imu_room import (
     USUAL_BAUDS,
     asked_bytes_per_s,
     imu_bytes_per_s,
+    signature_bytes,
 )
 from companion.advice.wanted import ARDUPILOT, PX4, Finding, Values
 from companion.config import FeedbackConfig, LinkConfig
 
 POSE_BYTES = {"odometry": 245, "vision_position": 129 + 69, "velocity": 245}
+FLOW_BYTES = {"optical_flow": 46, "optical_flow_rad": 56}
+OBSTACLES_HZ, OBSTACLES_BYTES, OBSTACLES_3D_BYTES = 10.0, 179, 15 * 37
+"""A message of 72 sectors, or as many cells of space as a camera of 65 degrees shows."""
 OTHER_BYTES_PER_S = 700.0
 """Our heartbeat, time synchronisation and status."""
+FULL = 0.95
+"""Utilisation by what we send beyond which it waits, ever longer, when the rest comes in bursts."""
 LINE_PARAMETERS = {
     ARDUPILOT: tuple(f"SERIAL{n}_{what}" for n in range(1, 9) for what in ("BAUD", "PROTOCOL")),
     PX4: (
@@ -32,16 +38,29 @@ def line_parameters(firmware: str) -> tuple[str, ...]:
     return LINE_PARAMETERS[firmware]
 
 
+def sent_bytes_per_s(
+    link: LinkConfig, feedback: FeedbackConfig, mode: str, camera_hz: float
+) -> float:
+    """Load by what we send, poses of this mode among it."""
+    signature = signature_bytes(link)
+    sent = OTHER_BYTES_PER_S
+    if mode != "off":
+        pose_hz = camera_hz * feedback.poses_per_frame(1.0 / camera_hz)
+        sent += pose_hz * (POSE_BYTES[mode] + signature)
+    if feedback.flow != "off":
+        sent += camera_hz * (FLOW_BYTES[feedback.flow] + signature)
+    if feedback.obstacle_distance:
+        each = OBSTACLES_3D_BYTES if feedback.obstacles_3d else OBSTACLES_BYTES
+        sent += OBSTACLES_HZ * (each + signature)
+    return sent
+
+
 def check_line(
-    firmware: str,
-    values: Values,
-    link: LinkConfig,
-    feedback: FeedbackConfig,
-    mode: str,
-    baud: int,
-) -> list[Finding]:
+    firmware: str, values: Values, link: LinkConfig, feedback: FeedbackConfig, mode: str,
+    camera_hz: float, baud: int,
+) -> list[Finding]:  # fmt: skip
     """Findings on the capacity of a serial line both ways, and PX4's own rate limit."""
-    up = feedback.rate_hz * POSE_BYTES[mode] + OTHER_BYTES_PER_S
+    up = sent_bytes_per_s(link, feedback, mode, camera_hz)
     down = asked_bytes_per_s(link) + imu_bytes_per_s(link, baud / BITS_PER_BYTE, firmware)
     needed_baud = max(up, down) * BITS_PER_BYTE / MAX_LOAD
     findings = []

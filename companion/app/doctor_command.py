@@ -112,7 +112,10 @@ async def _examine(
                 firmware, values, feedback, mode, latency_ms, config.gps, config.landing
             )
             if baud:
-                findings += check_line(firmware, values, config.link, feedback, mode, baud)
+                camera_hz = config.camera.rate_hz
+                findings += check_line(
+                    firmware, values, config.link, feedback, mode, camera_hz, baud
+                )
             findings += check_loop_rate(values, config.link)
             return findings, len(values)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -112,6 +113,10 @@ class FeedbackConfig:
     """Send OBSTACLE_DISTANCE: what stands around the vehicle by the newest images and depths."""
     obstacles_3d: bool = False
     """Send it to ArduPilot as OBSTACLE_DISTANCE_3D instead: with heights, above and below too."""
+
+    def poses_per_frame(self, frame_period_s: float) -> int:
+        """Number of poses sent from one frame to the next; all but one are predicted."""
+        return max(1, math.ceil(frame_period_s * self.rate_hz - 0.1))
 
     @property
     def sends_position(self) -> bool:

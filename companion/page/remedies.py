@@ -168,6 +168,7 @@ OF_REASON: Mapping[str, str] = {
     "position reset": "Wait a second: poses must be good for a while first.",
     "no autopilot clock": "Wait some seconds: the clocks are being compared.",
     "another companion on the link": "Switch one of the two off.",
+    "the link is too slow": "Raise the baud of the autopilot's port and of link.url.",
     "disk is slow": "Wait; then look at the disk.",
     "autopilot rebooted": "Wait some seconds.",
     "off": "feedback.mode is off: switch it on in Settings.",

@@ -15,7 +15,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.config import LinkConfig
+from companion.advice.line_rate import FULL, sent_bytes_per_s
+from companion.config import FeedbackConfig, LinkConfig
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import SourceHealth
 from companion.messages import Warned
@@ -146,6 +147,12 @@ class AutopilotLink:
                 self._takers[message_id].remove(take)
 
         return end
+
+    def carries(self, feedback: FeedbackConfig, camera_hz: float) -> bool:
+        """False of a serial line that is filled by what is to be sent: it would come too late."""
+        room = self.port.capacity_bytes_per_s
+        sent = sent_bytes_per_s(self._config, feedback, feedback.mode, camera_hz)
+        return room is None or sent <= FULL * room
 
     # -- what goes out ---------------------------------------------------------------------------
 

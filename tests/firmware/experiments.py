@@ -16,9 +16,11 @@ from tests.firmware.trial import Conditions, Trial
 from tests.firmware.way_back import WAY_BACK, way_back
 
 Flown = Callable[[Trial, Figures], None]
-HOLD_S, READY_S, PATIENT_S = 60.0, 30.0, 45.0
+HOLD_S, READY_S, PATIENT_S, SWING_S = 60.0, 30.0, 45.0, 40.0
 USUAL = "position on", "dead reckoning", "autopilot connected", "camera recovered"
 """Texts of a flight in which nothing is wrong."""
+SIXTY_POSES = "expert.feedback.rate_hz=60"
+"""A second: 15 kB, of which 115200 baud carry 11.5."""
 GLITCH_DEG = 50.0 / DEGREE_M
 
 
@@ -177,6 +179,22 @@ def wrong_set_up(trial: Trial, figures: Figures) -> None:
     figures.add_true("the pilot is told", bool(said), " / ".join(said))
 
 
+def wrong_lens(trial: Trial, figures: Figures) -> None:
+    """Another focal length than is said: told by turning to and fro, which a drone may in hand."""
+    stood, began_s = trial.ground.place_m, time.time()
+    if not manoeuvres.up(trial, figures):
+        return
+    said = trial.until("focal length", lambda: trial.said("focal length", began_s), 1.0)
+    figures.add_true("nothing is said before it turns", said is None)
+    turned_s = time.time()
+    manoeuvres.swing(trial)
+    said = trial.until("focal length", lambda: trial.said("focal length", turned_s), SWING_S)
+    figures.add("focal length said after so long of turning", said, "s", SWING_S)
+    level_m, _ = strayed_m(trial.ground.window(began_s, time.time()), stood)
+    figures.add("level way until then", level_m.max(), "m", 1.0)
+    manoeuvres.land(trial, figures, stood)
+
+
 def two_companions(trial: Trial, figures: Figures) -> None:
     """Two are started at once: neither begins while the other is there; then one flies."""
     trial.start_daemon()
@@ -216,8 +234,10 @@ EXPERIMENTS: dict[str, tuple[Flown, Conditions]] = {
     "way_back": (way_back, WAY_BACK),
     "mount_90": (wrong_set_up, Conditions(mount_roll_deg=90.0)),
     "upside_down": (wrong_set_up, Conditions(mount_roll_deg=180.0)),
-    "lens_10": (wrong_set_up, Conditions(lens_scale=1.1)),
+    "lens_10": (wrong_lens, Conditions(lens_scale=1.1)),
     "two_companions": (two_companions, Conditions()),
+    "baud_115200": (take_off, Conditions(baud=115200)),
+    "slow_link": (wrong_set_up, Conditions(baud=115200, settings=(SIXTY_POSES,))),
     "perfect": (tour, Conditions(perfect=True)),
     **{
         f"{name}={value}": (take_off, Conditions(parameters={name: value}))

@@ -60,7 +60,7 @@ def landing_marker(trial: Trial, figures: Figures) -> None:
     stood = trial.ground.place_m
     if not manoeuvres.up(trial, figures):
         return
-    seen = trial.until("marker", lambda: _told(trial, "marker in sight"), 10.0)
+    seen = trial.until("marker", lambda: trial.said("marker in sight"), 10.0)
     figures.add_true("marker in sight", seen is not None)
     down = trial.pilot.land(90.0)
     off = (trial.ground.place_m - stood)[:2] - np.array(MARKER_AT)
@@ -82,7 +82,7 @@ def spoofed(trial: Trial, figures: Figures) -> None:
     _deceive(trial, figures, "jump of 50 m", lambda _lasts_s: JUMPED_M)
     trial.pilot.set_parameters({"SIM_GPS1_GLTCH_X": 0.0})
     back_s = time.time()
-    again = trial.until("GPS", lambda: _told(trial, "EKF sources switched: GPS", back_s), 25.0)
+    again = trial.until("GPS", lambda: trial.said("EKF sources switched: GPS", back_s), 25.0)
     figures.add("used again after it is where it was", again, "s")
     time.sleep(manoeuvres.SETTLE_S)
     switched_s = _deceive(trial, figures, "pull of 1 m/s", lambda lasts_s: PULL_M_S * lasts_s)
@@ -92,7 +92,7 @@ def spoofed(trial: Trial, figures: Figures) -> None:
     trial.firmware.restart()
     restarted_s = time.time()
     trial.mark("autopilot restarted while its sources are switched")
-    again = trial.until("reboot", lambda: _told(trial, "autopilot reboot", restarted_s), 30.0)
+    again = trial.until("reboot", lambda: trial.said("autopilot reboot", restarted_s), 30.0)
     trial.ground.ask_for_messages()
     time.sleep(10.0)
     figures.add("its restart is seen after", again, "s")
@@ -129,7 +129,7 @@ def earth_position(trial: Trial, figures: Figures) -> None:
         trial.ground.command(SET_EKF_SOURCE_SET, 2.0)
     trial.mark("GPS goes")
     began_s = time.time()
-    sent = trial.until("place on earth", lambda: _told(trial, "global position by"), 30.0)
+    sent = trial.until("place on earth", lambda: trial.said("global position by"), 30.0)
     figures.add("place on earth by vision after", sent, "s", 10.0)
     time.sleep(30.0)
     level_m, _ = strayed_m(trial.ground.window(began_s, time.time()), before)
@@ -161,10 +161,6 @@ def wall(trial: Trial, figures: Figures) -> None:
     figures.add("nearer to the wall than 1.5 m by", max(0.0, CLEAR_M - clear_m), "m", 0.0,
                 f"{clear_m:.2f} m clear")  # fmt: skip
     trial.pilot.land()
-
-
-def _told(trial: Trial, text: str, since_s: float = 0.0) -> bool:
-    return any(text in said for said in trial.ground.texts_since(since_s))
 
 
 def _when_told(trial: Trial, since_s: float, *texts: str) -> float | None:

@@ -21,6 +21,7 @@ CIRCLE_RADIUS_M, CIRCLE_SPEED_M_S = 5.0, 2.0
 CORNERS = ((1, 0), (1, 1), (0, 1), (0, 0))
 TURN_S = 24.0
 MEAN_S = 1.0
+SWING_RAD, SWING_PERIOD_S = 0.5, 8.0
 
 
 def up(trial: Trial, figures: Figures) -> bool:
@@ -203,6 +204,16 @@ def turn(trial: Trial, figures: Figures) -> None:
     figures.add("full turn, level", percentile(level_m, 95), "m", 0.15)
     resets = (trial.feedback.get("n_resets") or 0) - (n_resets or 0)
     figures.add("full turn, resets", resets, "", 0.0)
+
+
+def swing(trial: Trial) -> None:
+    """Begin to turn to and fro on the spot, over ground that stays in view."""
+    ready_to_go(trial)
+    here, yaw_rad, began_s = trial.ground.believed_m, believed_yaw(trial), time.time()
+    rate = 2 * math.pi / SWING_PERIOD_S
+    trial.pilot.stream(
+        lambda: (here, np.zeros(3), yaw_rad + SWING_RAD * math.sin(rate * (time.time() - began_s)))
+    )
 
 
 def land(trial: Trial, figures: Figures, took_off_m: Array) -> None:

@@ -29,10 +29,10 @@ CAMERA_STREAM_BYTES_S = 4_000_000
 
 
 class Ports(NamedTuple):
-    """UDP ports on this machine that the firmware sends to."""
+    """UDP ports on this machine that the firmware sends to; the companion's may be PATH:BAUD."""
 
     ground: int
-    companion: int
+    companion: int | str
     camera: int
 
 
@@ -121,12 +121,16 @@ class ArduCopter(Simulator):
         serial = [
             word
             for number, port in enumerate(self.ports)
-            for word in (f"--serial{number}", f"udpclient:127.0.0.1:{port}")
+            for word in (f"--serial{number}", _line_to(port))
         ]
         return [
             str(self.binary), "--model", "quad", "--speedup", "1", "--home", home,
             "--defaults", f"{of_frame},{defaults}", *serial,
         ]  # fmt: skip
+
+
+def _line_to(port: int | str) -> str:
+    return f"uart:{port}" if isinstance(port, str) else f"udpclient:127.0.0.1:{port}"
 
 
 class Px4(Simulator):

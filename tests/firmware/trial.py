@@ -90,6 +90,8 @@ class Conditions:
     parameters: Mapping[str, float] = field(default_factory=dict)
     settings: tuple[str, ...] = ()
     camera_words: tuple[str, ...] = ()
+    baud: int = 0
+    """Of a serial line between autopilot and companion, ArduPilot's alone; 0: UDP."""
     nice: int = -5
     """Of everything that a real vehicle has a processor of its own for."""
 
@@ -106,7 +108,9 @@ class Trial:
         ground, cable = kind.FIXED if kind is Px4 else (free_port(), free_port())
         self._companion_port, self._camera_port = free_port(), free_port()
         self._second_port = free_port()
-        ports = Ports(ground, cable, self._camera_port)
+        self._line = tuple(self.folder / f"{end}.tty" for end in ("autopilot", "companion"))
+        line = f"{self._line[0]}:{conditions.baud}" if conditions.baud else ""
+        ports = Ports(ground, line or cable, self._camera_port)
         self.firmware: Simulator = kind(firmware, self.folder, ports, self._parameters(kind))
         self.ground = Ground(ground, kind.home, self.folder / "ground.tlog")
         self.pilot: Pilot = PILOTS[kind.name](self.ground, self.firmware)
@@ -145,10 +149,7 @@ class Trial:
         with ExitStack() as entering:
             entering.callback(self._write)
             entering.enter_context(self.ground)
-            self._cable = entering.enter_context(self._child(
-                "faulty_cable", self.firmware.ports.companion,
-                f"{self._companion_port},{self._second_port}", self.folder / "cable.tlog",
-            ))  # fmt: skip
+            self._cable = entering.enter_context(self._cable_between())
             self._camera = entering.enter_context(self._drawn_camera())
             entering.enter_context(self.firmware)
             entering.callback(self._stop_daemon)
@@ -205,12 +206,15 @@ class Trial:
 
     def _settings(self) -> list[str]:
         home, c = self.firmware.home, self.conditions
+        url = f"udpin:127.0.0.1:{self._companion_port}"
+        if c.baud:
+            url = f"serial:{self._line[1]}:{c.baud}"
         return [
             "camera.source=network", f"camera.url=tcp://127.0.0.1:{self._video_port}",
             f"camera.rate_hz={CAMERA_HZ:g}", f"expert.camera.stamp_offset_ms={-LATENCY_MS - 1:g}",
             f"camera.calibration={self.folder / 'lens.toml'}",
             "mount.known=true", f"mount.pitch_deg={c.pitch_deg:g}",
-            f"link.url=udpin:127.0.0.1:{self._companion_port}", f"expert.link.backend={c.backend}",
+            f"link.url={url}", f"expert.link.backend={c.backend}",
             f"feedback.mode={c.pose_mode}", f"feedback.origin_latitude_deg={home.latitude_deg}",
             f"feedback.origin_longitude_deg={home.longitude_deg}",
             f"feedback.origin_altitude_m={home.altitude_m}",
@@ -281,6 +285,10 @@ class Trial:
         self.mark(f"in vain: {what}")
         return None
 
+    def said(self, text: str, since_s: float = 0.0) -> bool:
+        """Whether the pilot has read it."""
+        return any(text in each for each in self.ground.texts_since(since_s))
+
     def last_pose_s(self) -> float:
         """When the autopilot last passed one of our poses on to the ground, else was sent one."""
         return max(self.ground.came_s.get(f"COMPANION/{kind}", 0.0) for kind in POSES)
@@ -306,6 +314,13 @@ class Trial:
                     process.communicate()
 
         return running()
+
+    def _cable_between(self) -> contextlib.AbstractContextManager[Any]:
+        log = self.folder / "cable.tlog"
+        if self.conditions.baud:
+            return self._child("serial_cable", self.conditions.baud, *self._line, log)
+        companions = f"{self._companion_port},{self._second_port}"
+        return self._child("faulty_cable", self.firmware.ports.companion, companions, log)
 
     def _drawn_camera(self) -> contextlib.AbstractContextManager[Any]:
         c = self.conditions

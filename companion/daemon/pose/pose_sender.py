@@ -43,6 +43,7 @@ ALOFT = (POSITION_ON(), DEAD_RECKONING())
 """Last texts while poses are sent."""
 UNHEARD = "the autopilot is silent"
 SWITCHED_OFF = "switched off"
+LINK_TOO_SLOW = "the link is too slow"
 OTHER_COMPANION = "another companion on the link"
 SAY_WHY_AFTER_NS, SAY_WHY_EVERY_NS = 30_000_000_000, 60_000_000_000
 """Without a pose for the first, the pilot is told why, and again after the second."""
@@ -60,6 +61,7 @@ class PoseSender(Sender):
     def __init__(
         self,
         config: FeedbackConfig,
+        camera_hz: float,
         link: AutopilotLink,
         clock: FlightClock,
         counter_path: Path,
@@ -67,6 +69,7 @@ class PoseSender(Sender):
         journal: Callable[[GateStep], None],
     ) -> None:
         self._config, self._link, self._clock = config, link, clock
+        self._camera_hz = camera_hz
         counter, height = ResetCounter(), AutopilotHeight(link)
         self._counter = SentCounter(counter_path, counter, height, link, clock, warn)
         self._gate = JournaledPoseGate(
@@ -92,7 +95,11 @@ class PoseSender(Sender):
 
     def _may_start(self, now_ns: int) -> str:
         """Reason why no first pose of a sequence may be sent now; "" if it may."""
-        return OTHER_COMPANION if self._yields else self._counter.may_start(now_ns)
+        if self._yields:
+            return OTHER_COMPANION
+        if not self._link.carries(self._config, self._camera_hz):
+            return LINK_TOO_SLOW
+        return self._counter.may_start(now_ns)
 
     def _look_for_another(self, now_ns: int) -> None:
         """Yield to another companion, unless poses were sent before it came."""

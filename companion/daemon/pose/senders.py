@@ -32,8 +32,9 @@ class Senders:
     ) -> None:  # fmt: skip
         use, feedback = config.telemetry.use, config.feedback
         poses = self._poses = PoseSender(
-            feedback, link, clock, counter_path(config.daemon.flights), warn, journal
-        )
+            feedback, config.camera.rate_hz, link, clock, counter_path(config.daemon.flights),
+            warn, journal,
+        )  # fmt: skip
         self._all: list[Sender] = [poses, FlowSender(feedback, link, clock, journal)]
         if config.landing.marker != "off":
             self._all.append(LandingSender(config.landing, link, clock, use, journal))

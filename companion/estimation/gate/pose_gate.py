@@ -207,7 +207,7 @@ class PoseGate:
     def _next_step(self) -> tuple[int, int]:
         """Interval of poses, and time after a frame of the next that is to be predicted, ns."""
         period_ns = self._period_ns()
-        n_steps = max(1, int(np.ceil(period_ns * 1e-9 * self._config.rate_hz - 0.1)))
+        n_steps = self._config.poses_per_frame(period_ns * 1e-9)
         step_ns = period_ns // n_steps
         number = self._n_predicted + 1
         # give a frame that is due itself some slack

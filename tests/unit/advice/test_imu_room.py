@@ -63,7 +63,7 @@ def test_px4_keeps_to_half_of_a_line() -> None:
     assert 50 <= room.rate_hz < 100 and load <= 0.5 * 23040
     values = {"MAV_1_CONFIG": 102.0, "MAV_1_RATE": 0.0, "SER_TEL2_BAUD": 230400.0}
     feedback = FeedbackConfig()
-    assert check_line("px4", values, UNSIGNED, feedback, "odometry", 230400) == []
+    assert check_line("px4", values, UNSIGNED, feedback, "odometry", 30.0, 230400) == []
 
 
 def test_a_network_is_tried() -> None:

@@ -1,11 +1,12 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import pytest
 
 from companion.advice.firmware_rules import RULES
-from companion.advice.line_rate import check_line, line_parameters
+from companion.advice.line_rate import check_line, line_parameters, sent_bytes_per_s
 from companion.advice.pose_parameters import advise, names_to_read
 from companion.advice.wanted import FIRMWARES, Finding
 from companion.config import FeedbackConfig, GpsConfig, LandingConfig, LinkConfig
@@ -203,21 +204,35 @@ def test_a_place_on_earth_needs_a_slot_of_its_id() -> None:
 
 def test_slow_line_is_reported_by_port() -> None:
     link = LinkConfig(url="serial:/dev/ttyTHS1:57600")
-    (slow,) = check_line("ardupilot", NEW["ardupilot"], link, FEEDBACK, "odometry", 57600)
+    (slow,) = check_line("ardupilot", NEW["ardupilot"], link, FEEDBACK, "odometry", 30.0, 57600)
     assert (slow.name, slow.value) == ("SERIAL1_BAUD", 57600)
     assert slow.wanted.startswith("230400")
-    assert check_line("ardupilot", NEW["ardupilot"], link, FEEDBACK, "odometry", 921600) == []
-    (slow,) = check_line("px4", {}, link, FEEDBACK, "odometry", 57600)
+    assert check_line("ardupilot", NEW["ardupilot"], link, FEEDBACK, "odometry", 30.0, 921600) == []
+    (slow,) = check_line("px4", {}, link, FEEDBACK, "odometry", 30.0, 57600)
     assert slow.name == "SER_…_BAUD"
+
+
+def test_line_is_to_carry_all_that_is_sent() -> None:
+    link = LinkConfig(url="serial:/dev/ttyTHS1:230400")
+    more = replace(FEEDBACK, flow="optical_flow", obstacle_distance=True, obstacles_3d=True)
+    for feedback, camera_hz, enough in ((FEEDBACK, 30.0, True), (FEEDBACK, 60.0, False),
+                                        (more, 30.0, False)):  # fmt: skip
+        found = check_line("ardupilot", {}, link, feedback, "odometry", camera_hz, 230400)
+        assert (found == []) is enough
+
+
+def test_poses_are_sent_by_whole_parts_of_a_frame() -> None:
+    sent = [sent_bytes_per_s(LinkConfig(), FEEDBACK, "odometry", hz) for hz in (20.0, 30.0, 60.0)]
+    assert sent == [700.0 + 245 * n for n in (40, 30, 60)]
 
 
 def test_px4_rate_limit() -> None:
     link = LinkConfig(url="serial:/dev/ttyTHS1:921600", attitude_hz=100, imu_hz=200)
     values = {**NEW["px4"], "MAV_1_CONFIG": 102, "MAV_1_RATE": 1200}
-    (slow,) = check_line("px4", values, link, FEEDBACK, "odometry", 921600)
+    (slow,) = check_line("px4", values, link, FEEDBACK, "odometry", 30.0, 921600)
     assert (slow.name, slow.reboot) == ("MAV_1_RATE", True)
     values["MAV_1_RATE"] = 0
-    assert check_line("px4", values, link, FEEDBACK, "odometry", 921600) == []
+    assert check_line("px4", values, link, FEEDBACK, "odometry", 30.0, 921600) == []
 
 
 def test_names_fit_a_parameter() -> None:

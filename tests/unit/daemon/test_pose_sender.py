@@ -26,6 +26,7 @@ from tests.support.autopilot.memory_link import SetClock, listen, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
 
 MS = 1_000_000
+CAMERA_HZ = 20.0
 DOWN_M = -3.0
 """Of the body in our world."""
 
@@ -46,15 +47,18 @@ class Vehicle:
         self.seq = 0
         self.other: int | None = None
         """Mark in the heartbeat of another companion; None: there is none."""
+        self.line_bytes_per_s: float | None = None
         self.joins = True
         """Whether disks are as fast as they should be."""
 
     async def begin(self) -> None:
         """Start a process of ours: one that was killed leaves nothing behind but its files."""
         self.port = MemoryPort()
+        self.port.capacity_bytes_per_s = self.line_bytes_per_s
         self.link = memory_link(self.port, self.clock, self._deliver, self.warned.append)
         self.sender = PoseSender(
             FeedbackConfig(mode=self.mode),
+            CAMERA_HZ,
             self.link,
             self.clock,
             self.path,
@@ -86,7 +90,7 @@ class Vehicle:
                 self._say(mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0))
             if now_ns % (100 * MS) == 0:
                 self._say_slow(boot_ms)
-            if frames and now_ns % (50 * MS) == 0:
+            if frames and now_ns % int(1e9 / CAMERA_HZ) == 0:
                 self.seq += 1
                 odometry = self._odometry(now_ns - 40 * MS, resets)
                 if blind:
@@ -393,6 +397,19 @@ async def test_nothing_begins_beside_another_companion(tmp_path: Path) -> None:
     vehicle.armed, vehicle.other = True, None  # gone in the air, where its poses were flown on
     assert not vehicle.run(10)
     vehicle.armed = False
+    assert vehicle.run(5)
+
+
+@flown
+async def test_nothing_begins_on_a_line_that_is_too_slow(tmp_path: Path) -> None:
+    vehicle = Vehicle(tmp_path / "kept.json")
+    vehicle.line_bytes_per_s = 10800.0  # 40 poses of 245 bytes a second, and 700 beside
+    await vehicle.begin()
+    assert not vehicle.run(35)
+    assert vehicle.why_not == "the link is too slow"
+    assert vehicle.texts == ["Companion: no vision position: link too slow"]
+    vehicle.line_bytes_per_s = 11520.0
+    await vehicle.begin()
     assert vehicle.run(5)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import struct
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from tests.firmware.figures import Figures, append_to, strayed_m
 from tests.firmware.ground import messages_heard
 from tests.firmware.page import write_page
 from tests.firmware.sent_poses import add_poses
+from tests.firmware.serial_cable import OneWay, opened
 from tests.firmware.true_state import State
 from tests.support.autopilot.fake_wire import free_port
 
@@ -113,3 +115,23 @@ def test_a_cable_that_is_cut_lets_nothing_through() -> None:
         assert len(log.getvalue()) == 8 + len(data)
     finally:
         cable.close()
+
+
+def test_a_serial_cable_passes_what_its_baud_allows(tmp_path: Path) -> None:
+    source, far = opened(tmp_path / "source")
+    sink, end = opened(tmp_path / "sink")
+    log = io.BytesIO()
+    try:
+        way = OneWay(source, sink, 11520.0, log)
+        way.step(60.0)  # idle: nothing is saved up
+        data = odometry(mavlink.MAVLink(None, 1, 197), 1.0, 2.0, 0)
+        os.write(far, data)
+        way.step(0.01)
+        assert len(os.read(end, 1000)) == 116
+        assert not log.getvalue()
+        way.step(0.02)
+        assert len(os.read(end, 1000)) == len(data) - 116
+        assert log.getvalue()[8:] == data
+    finally:
+        for each in (source, far, sink, end):
+            os.close(each)
