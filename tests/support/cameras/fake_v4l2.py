@@ -249,7 +249,9 @@ class FakeV4l2:
             raise _refusal(errno.EAGAIN)
         if not self._queued:
             raise _refusal(errno.EAGAIN)
-        self._next_s += 1 / self.rate_hz
+        # by its own clock: who comes late finds pictures that wait, a period apart
+        filled_s = max(self._next_s, time.monotonic() - N_BUFFERS / self.rate_hz)
+        self._next_s = filled_s + 1 / self.rate_hz
         data = self._data()
         about.index = self._queued.popleft()
         if plane is None:
@@ -259,7 +261,7 @@ class FakeV4l2:
             plane.data_offset, plane.bytesused = DATA_OFFSET, len(data)
         os.pwrite(fd, data, about.index * PAGES)
         about.flags = self.flags | (v4l2.BUF_FLAG_ERROR if self.damaged else 0)
-        self.last_stamp_ns = time.monotonic_ns() - self.lag_ns
+        self.last_stamp_ns = int(filled_s * 1e9) - self.lag_ns
         about.timestamp.tv_sec = self.last_stamp_ns // 1_000_000_000
         about.timestamp.tv_usec = self.last_stamp_ns % 1_000_000_000 // 1000
         about.sequence = self._sequence + self.n_lost
