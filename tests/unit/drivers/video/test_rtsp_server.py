@@ -115,6 +115,7 @@ def test_pictures_never_wait_for_a_server_that_is_stopped() -> None:
         began_s = time.monotonic()
         taken = [server.send(bytes(100_000)) for _ in range(100)]
         assert time.monotonic() - began_s < 5.0
-        assert taken[0] and not any(taken[20:])
+        # what passes its buffers to the system may come late: by number, not by which
+        assert taken[0] and sum(taken) < 20
     finally:
         server.close()
