@@ -277,6 +277,10 @@ def _refined(pose: Pose, matches: _Matches, min_parallax_rad: float) -> tuple[Po
     ok = matches.consistent(points, pose, GAMMA)
     if ok.sum() < MIN_POINTS or ok.sum() < 0.5 * len(ok):
         return None
+    if matches.rotation_prior is not None:
+        # wrong matches may agree on a turn, which gives what is far a parallax
+        _, measured = matches.triangulated(Pose(matches.rotation_prior, pose.translation))
+        cosine = np.maximum(cosine, measured)
     parallax = float(np.arccos(np.clip(np.quantile(cosine[ok], 0.3), -1, 1)))
     if parallax < min_parallax_rad or not _direction_certain(pose, matches, ok):
         return None

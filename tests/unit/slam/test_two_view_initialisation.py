@@ -106,3 +106,24 @@ def stepped_aside(way_m: float, seed: int) -> TwoViewGeometry | None:
 def test_direction_must_be_certain_without_attitude() -> None:
     assert all(stepped_aside(0.3, seed) is None for seed in range(6))
     assert any(stepped_aside(1.2, seed) is not None for seed in range(6))
+
+
+def seen_with(measured: Array, seed: int) -> TwoViewGeometry | None:
+    """A step aside by 1.3 to 2.5 degrees of parallax, beside a turn by the autopilot."""
+    rng = np.random.default_rng(seed)
+    seen_a, depth = rng.uniform(-0.5, 0.5, (N, 2)), rng.uniform(8.0, 15.0, N)
+    points_b = np.c_[seen_a, np.ones(N)] * depth[:, None] - [0.35, 0.0, 0.0]
+    seen_b = points_b[:, :2] / points_b[:, 2:]
+    seen_a, seen_b = (s + rng.normal(scale=0.5 / FOCAL_PX, size=s.shape) for s in (seen_a, seen_b))
+    index = np.arange(N)
+    return initialise(
+        features(seen_a), features(seen_b), index, index, FOCAL_PX, seed, (measured, np.eye(3)),
+        np.radians(1.0),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_turn_that_nobody_measured_shows_no_parallax(seed: int) -> None:
+    """Wrong matches may agree on one, and then all that is far seems to be near."""
+    assert seen_with(np.eye(3), seed) is not None
+    assert seen_with(rotation_from_vector(np.radians([0.0, -1.6, 0.0])), seed) is None
