@@ -21,10 +21,17 @@ from companion.streaming.viewer.colours import Colours
 from companion.streaming.viewer.drawing import Drawing
 
 
+def _end(stop: threading.Event) -> None:
+    signal.sigwait({signal.SIGTERM})
+    stop.set()
+
+
 def main() -> None:
     address, out, rrd = sys.argv[1:4]
     stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    # by a thread: a handler would wait for the event's lock, which this thread may hold
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    threading.Thread(target=_end, args=(stop,), daemon=True).start()
     recording = rr.RecordingStream("links")
     recording.save(rrd)
     drawing = Drawing(recording, live=True, colours=Colours.PICTURE)
