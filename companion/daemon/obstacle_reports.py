@@ -1,6 +1,7 @@
 """Obstacles to the autopilot, ten times a second: OBSTACLE_DISTANCE, or with heights.
 
-What a round went by goes to the recording, so that a replay as flown finds the same again.
+What a round went by goes to the recording, so that a replay as flown finds the same again, and what
+it found to viewers and topics.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from companion.estimation.gate.gate_journal import OBSTACLES, GateJournal
 from companion.flight_notes import GateStep, ObstaclePoints
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array
-from companion.messages import DepthMap, Frame, MapUpdate, PointChunk, Track
+from companion.messages import DepthMap, Frame, MapUpdate, ObstaclesSeen, PointChunk, Track
 from companion.obstacles.depth_points import obstacle_points
+from companion.obstacles.obstacle_edges import nothing_seen, seen_around
 from companion.obstacles.obstacle_finder import ObstacleFinder, Round
 from companion.obstacles.obstacle_sectors import FREE_M, MAX_M, Obstacles
 from companion.timing.clock import FlightClock
@@ -50,23 +52,24 @@ class Look:
 class ObstacleReports:
     """Frames and the map of the current flight in; obstacles out.
 
-    `record` takes notes for the recording.
+    `pass_on` takes notes for the recording, and what viewers are shown.
     """
 
     def __init__(
         self, config: FeedbackConfig, link: AutopilotLink, clock: FlightClock,
-        record: Callable[[GateStep | ObstaclePoints], None],
+        pass_on: Callable[[GateStep | ObstaclePoints | ObstaclesSeen], None],
     ) -> None:  # fmt: skip
-        self._config, self._link, self._clock, self._record = config, link, clock, record
-        self._journal = GateJournal(OBSTACLES, record)
+        self._config, self._link, self._clock, self._pass_on = config, link, clock, pass_on
+        self._journal = GateJournal(OBSTACLES, pass_on)
         self._finder: ObstacleFinder | None = None
         self._known_ns: int | None = None
         self._n_parts = 0
+        self._is_shown = False
 
     def restart(self, camera: Camera | None) -> None:
         """Begin another flight with another map."""
         self._finder = None if camera is None else ObstacleFinder(camera)
-        self._known_ns, self._n_parts = None, 0
+        self._known_ns, self._n_parts, self._is_shown = None, 0, False
 
     def take(self, message: Track | MapUpdate | DepthMap | PointChunk) -> None:
         """Take a track, a map update, a depth map or points."""
@@ -106,11 +109,12 @@ class ObstacleReports:
             return []  # another flight has begun meanwhile
         if found is not None:
             self._known_ns = look.t_ns
+        self._show(look, found)
         known_ns = look.t_ns if self._known_ns is None else self._known_ns
         sent = look.t_ns - known_ns <= UNKNOWN_AFTER_NS
         if look.given is not None:
             for part in parts:
-                self._record(part)
+                self._pass_on(part)
             self._n_parts += len(parts)
             by = {
                 "n_taken": look.given.n_taken, "n_parts": self._n_parts,
@@ -121,6 +125,16 @@ class ObstacleReports:
         for message in messages:
             self._link.send(message)
         return messages
+
+    def _show(self, look: Look, found: Obstacles | Array | None) -> None:
+        """Pass on what is drawn; nothing, once, when nothing is known any more."""
+        looked_from = None if look.finder is None else look.finder.looked_from
+        if found is not None and looked_from is not None:
+            t_ns, world_from_body = looked_from
+            self._pass_on(seen_around(t_ns, found, world_from_body))
+        elif self._is_shown:
+            self._pass_on(nothing_seen(look.t_ns))
+        self._is_shown = found is not None
 
     @property
     def _firmware(self) -> str:

@@ -13,7 +13,7 @@ from companion.daemon.health_watch import HealthWatch
 from companion.daemon.obstacle_reports import OBSTACLES_HZ, ObstacleReports
 from companion.flight_notes import GateStep, ObstaclePoints
 from companion.geometry.camera import Camera
-from companion.messages import Frame
+from companion.messages import Frame, ObstaclesSeen
 from companion.pilot_messages import RECORDING_NO_FLIGHT, RECORDING_SET_OFF, PilotText
 from companion.timing.clock import FlightClock
 from drivers.images.still_pictures import StillPictures
@@ -45,18 +45,18 @@ COMPUTER_HZ, TICK_S = 1.0, 0.1
 class VehicleReports:
     """Sends ONBOARD_COMPUTER_STATUS, by default each second, and obstacles.
 
-    `record` takes notes of obstacles for the recording.
+    `pass_on` takes notes of obstacles for the recording, and what viewers are shown of them.
     """
 
     def __init__(
         self, link: AutopilotLink, clock: FlightClock, watch: HealthWatch, config: Config,
-        record: Callable[[GateStep | ObstaclePoints], None],
+        pass_on: Callable[[GateStep | ObstaclePoints | ObstaclesSeen], None],
         recording: FlightRecording = NOTHING_RECORDED,
     ) -> None:  # fmt: skip
         self._link, self._clock, self._watch, self._config = link, clock, watch, config
         self.obstacles: ObstacleReports | None = None
         if config.feedback.obstacle_distance:
-            self.obstacles = ObstacleReports(config.feedback, link, clock, record)
+            self.obstacles = ObstacleReports(config.feedback, link, clock, pass_on)
         self._camera: Camera | None = None
         self._camera_component: CameraComponent | None = None
         self._stills: StillPictures | None = None

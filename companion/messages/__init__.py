@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from companion.messages.dense_messages import DepthMap, PixelState, PointChunk
+from companion.messages.dense_messages import DepthMap, ObstaclesSeen, PixelState, PointChunk
 from companion.messages.frame_messages import (
     NO_PICTURE,
     Bytes,
@@ -37,8 +37,9 @@ from companion.telemetry import Telemetry
 __all__ = [
     "NO_PICTURE", "SPANS_REACH", "Bytes", "ClockReport", "DepthMap", "Floats", "Frame",
     "FrameOverdue", "FrameTracked", "Georeference", "Georeferenced", "KeyframeAdded",
-    "LandingTarget", "LoopClosed", "MapTakenUp", "MapUpdate", "Message", "Odometry",
-    "OpticalFlow", "PixelState", "PointChunk", "SiteMapUsed", "Track", "TrackState", "Warned",
+    "LandingTarget", "LoopClosed", "MapTakenUp", "MapUpdate", "Message", "ObstaclesSeen",
+    "Odometry", "OpticalFlow", "PixelState", "PointChunk", "SiteMapUsed", "Track", "TrackState",
+    "Warned",
 ]  # fmt: skip
 
 
@@ -67,5 +68,5 @@ class ClockReport:
 Message = (
     Frame | Telemetry | Track | Odometry | KeyframeAdded | LoopClosed | MapUpdate | DepthMap
     | PointChunk | Warned | Georeferenced | FrameTracked | FrameOverdue | OpticalFlow
-    | LandingTarget | SiteMapUsed | MapTakenUp
+    | LandingTarget | SiteMapUsed | MapTakenUp | ObstaclesSeen
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Messages of the dense map: depth maps and fused points of keyframes."""
+"""Messages of the dense map: depth maps, fused points of keyframes, and obstacles."""
 
 from __future__ import annotations
 
@@ -58,3 +58,18 @@ class PointChunk:
     normals_camera: Floats
     sigma: Floats
     spans: Mapping[int, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObstaclesSeen:
+    """Obstacles and free space around the vehicle, as they are told to the autopilot.
+
+    `eye_world` (3,) is where the vehicle was at `t_ns`, the exposure of the newest image. Edges
+    (N, 2, 3) lie level across the line of sight: `edges_world` at the nearest thing of a direction,
+    `free_world` where a direction is free up to. What is unknown has none. f32, metres.
+    """
+
+    t_ns: int
+    eye_world: Floats
+    edges_world: Floats
+    free_world: Floats

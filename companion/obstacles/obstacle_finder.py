@@ -107,6 +107,8 @@ class ObstacleFinder:
         self._greys: deque[tuple[int, Bytes]] = deque(maxlen=MOST_TRACKS)
         """The newest images by their numbers: of one its track comes some images later."""
         self._sighted = -1
+        self.looked_from: tuple[int, Pose] | None = None
+        """Exposure of the image that the last known obstacles go by, and `world_from_body` then."""
 
     def _forget(self) -> None:
         self._grid = OccupancyGrid()
@@ -151,6 +153,7 @@ class ObstacleFinder:
         known = self._known(given, parts)
         if known is None:
             return None
+        self.looked_from = known.t_ns, known.world_from_body
         return self._in_space(known) if reach_m is None else self._in_sectors(known, reach_m)
 
     def _in_sectors(self, known: _Known, reach_m: float) -> Obstacles:

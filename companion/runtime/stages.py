@@ -23,6 +23,7 @@ from companion.messages import (
     LoopClosed,
     MapTakenUp,
     MapUpdate,
+    ObstaclesSeen,
     Odometry,
     OpticalFlow,
     PointChunk,
@@ -103,14 +104,15 @@ STAGES = (
         nice=5, frames=Frames.EVERY, answer_s=60.0, hurried_s=0.3, with_flight=True, in_folder=True,
     ),
     Stage(
-        "topics", (Frame, Odometry, Track, KeyframeAdded, MapUpdate, DepthMap, PointChunk),
+        "topics",
+        (Frame, Odometry, Track, KeyframeAdded, MapUpdate, DepthMap, PointChunk, ObstaclesSeen),
         nice=10, answer_s=30.0, finish_s=15.0, with_flight=True,
     ),
     Stage(
         "viewers",
         (
             Frame, PositionSample, *CURVES, Warned, Health, GeoOrigin, Odometry, Track,
-            KeyframeAdded, MapUpdate, DepthMap, PointChunk,
+            KeyframeAdded, MapUpdate, DepthMap, PointChunk, ObstaclesSeen,
         ),
         nice=10, frames=Frames.EVERY, answer_s=30.0, finish_s=6.0, with_flight=True,
         frame_every_ns=60_000_000,

@@ -20,6 +20,7 @@ from companion.messages import (
     KeyframeAdded,
     MapUpdate,
     Message,
+    ObstaclesSeen,
     Odometry,
     PointChunk,
     Track,
@@ -38,6 +39,7 @@ from companion.topics.message_codec import (
     depth_envelope,
     keyframe_envelope,
     map_envelope,
+    obstacles_envelope,
     pose_envelope,
     world_place,
 )
@@ -45,7 +47,10 @@ from drivers.system.ros_messages import image_cdr, odometry_cdr, points_cdr
 from drivers.system.ros_topics import RosTopics
 from drivers.system.zenoh_bus import LAST, URGENT, USUAL, ZenohBus
 
-TOPICS = {"pose": URGENT, "keyframe": USUAL, "map": USUAL, "depth": LAST, "cloud": LAST}
+TOPICS = {
+    "pose": URGENT, "obstacles": URGENT, "keyframe": USUAL, "map": USUAL, "depth": LAST,
+    "cloud": LAST,
+}  # fmt: skip
 BYTES_S_PER_KBIT_S = 125.0
 NEW_SHARE = 0.75
 """Share of the budget for new bundles; the rest is for catching up."""
@@ -104,6 +109,8 @@ class Topics(Work):
                     self._take_bundle(bundle)
         if isinstance(message, Odometry):
             self._publish("pose", partial(pose_envelope, self._flight, message))
+        elif isinstance(message, ObstaclesSeen):
+            self._publish("obstacles", partial(obstacles_envelope, self._flight, message))
         elif isinstance(message, DepthMap):
             self._publish("depth", partial(depth_envelope, self._flight, message, self._update))
         elif isinstance(message, PointChunk):

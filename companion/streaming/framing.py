@@ -19,7 +19,7 @@ import struct
 
 from companion.errors import StreamError
 
-HELLO = b"CMPV\x01"
+HELLO = b"CMPV\x02"
 VIEWER_BYTES = 16
 HELLO_BYTES = len(HELLO) + VIEWER_BYTES
 ACKNOWLEDGED = struct.Struct("<Q")

@@ -12,6 +12,7 @@
 | POINTS | t_ns, keyframe, level, points as in companion.streaming.point_codec |
 | PICTURE | t_ns, width, number of found points, these as u16 pairs, JPEG |
 | DEPTH | t_ns, length of media type, media type, image |
+| OBSTACLES | t_ns, eye (3) f32, number of edges that are near, all (N, 2, 3) i16, cm from the eye |
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ from companion.streaming.items import (
     FlightItem,
     Item,
     LogItem,
+    ObstaclesItem,
     PathItem,
     PictureItem,
     PlacesItem,
@@ -69,6 +71,7 @@ class Kind(IntEnum):
     FINE = 9
     PICTURE = 10
     DEPTH = 11
+    OBSTACLES = 12
 
 
 TIME = struct.Struct("<q")
@@ -77,6 +80,7 @@ PLACE = struct.Struct("<if3f4h")
 PIECE = struct.Struct("<qIi")
 POINTS = struct.Struct("<qiB")
 PICTURE = struct.Struct("<qHH")
+OBSTACLES = struct.Struct("<q3fH")
 SHOWN = list(Shown)
 LEVELS = [WHOLE, COARSE, FINE]
 MOST_JSON_BYTES = 65536
@@ -110,6 +114,8 @@ def encode(item: Item) -> bytes:
     if isinstance(item, DepthItem):
         media = item.media_type.encode()
         return TIME.pack(item.t_ns) + bytes([len(media)]) + media + item.image
+    if isinstance(item, ObstaclesItem):
+        return _obstacles(item)
     raise TypeError(f"{type(item).__name__} does not go over a link")
 
 
@@ -151,6 +157,8 @@ def _decode(kind: Kind, data: bytes) -> Item:
         found = np.frombuffer(data, "<u2", 2 * n, PICTURE.size).reshape(n, 2)
         jpeg = data[PICTURE.size + 4 * n :]
         return PictureItem(t_ns, jpeg, width, found.astype(np.float32) / np.float32(8))
+    if kind is Kind.OBSTACLES:
+        return _obstacles_of(data)
     media = rest[1 : 1 + rest[0]].decode()
     return DepthItem(t_ns, rest[1 + rest[0] :], media)
 
@@ -216,6 +224,22 @@ def _flight_of(data: bytes) -> FlightItem:
     origin = GeoOrigin(**found["origin"]) if found["origin"] is not None else None
     camera = Camera(size[0], size[1], lens[0], lens[1], lens[2], lens[3])
     return FlightItem(str(found["flight_id"]), str(found["name"]), camera, origin)
+
+
+def _obstacles(item: ObstaclesItem) -> bytes:
+    ends = np.concatenate([item.edges_world, item.free_world]) - item.eye_world
+    head = OBSTACLES.pack(item.t_ns, *map(float, item.eye_world), len(item.edges_world))
+    return head + np.clip(np.rint(100 * ends), -32768, 32767).astype("<i2").tobytes()
+
+
+def _obstacles_of(data: bytes) -> ObstaclesItem:
+    t_ns, *eye, n = OBSTACLES.unpack_from(data)
+    ends = np.frombuffer(data, "<i2", -1, OBSTACLES.size).reshape(-1, 2, 3)
+    eye_world = np.array(eye, np.float32)
+    if not np.isfinite(eye_world).all() or n > len(ends):
+        raise ValueError("obstacles that are nowhere")
+    edges = eye_world + ends.astype(np.float32) / np.float32(100)
+    return ObstaclesItem(t_ns, eye_world, edges[:n], edges[n:])
 
 
 def _number(value: float | None) -> float:

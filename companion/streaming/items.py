@@ -154,7 +154,17 @@ class DepthItem:
     kernel_ms: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ObstaclesItem:
+    """Obstacles and free space now: edges (N, 2, 3) in the world, and from where (3,)."""
+
+    t_ns: int
+    eye_world: Floats
+    edges_world: Floats
+    free_world: Floats
+
+
 Item = (
     FlightItem | PoseItem | StatusItem | LogItem | PlacesItem | PathItem | AutopilotPathItem
-    | PointsItem | SparseItem | ImageItem | PictureItem | DepthItem
+    | PointsItem | SparseItem | ImageItem | PictureItem | DepthItem | ObstaclesItem
 )  # fmt: skip

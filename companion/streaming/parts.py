@@ -17,6 +17,7 @@ from companion.streaming.items import (
     FlightItem,
     Item,
     LogItem,
+    ObstaclesItem,
     PathItem,
     PlacesItem,
     PointsItem,
@@ -31,6 +32,7 @@ NEWEST = 0
 """Key of items of which there is only one."""
 SINGLE: dict[type[Item], Kind] = {
     PoseItem: Kind.POSE, FlightItem: Kind.FLIGHT, DepthItem: Kind.DEPTH, LogItem: Kind.LOG,
+    ObstaclesItem: Kind.OBSTACLES,
 }  # fmt: skip
 
 

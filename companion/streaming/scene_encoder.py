@@ -18,6 +18,7 @@ from companion.messages import (
     KeyframeAdded,
     MapUpdate,
     Message,
+    ObstaclesSeen,
     Odometry,
     PointChunk,
     Track,
@@ -33,6 +34,7 @@ from companion.streaming.items import (
     ImageItem,
     Item,
     LogItem,
+    ObstaclesItem,
     PathItem,
     PointsItem,
     PoseItem,
@@ -131,6 +133,10 @@ class SceneEncoder:
         elif isinstance(message, DepthMap):
             item = depth_picture(message)
             out += [item] if item is not None else []
+        elif isinstance(message, ObstaclesSeen):
+            out.append(ObstaclesItem(
+                message.t_ns, message.eye_world, message.edges_world, message.free_world
+            ))  # fmt: skip
         elif isinstance(message, KeyframeAdded):
             out += self._placement.added(message)
         elif isinstance(message, PositionSample):

@@ -20,19 +20,20 @@ from companion.streaming.parts import NEWEST
 from companion.streaming.send_window import SendWindow
 
 ORDER = (
-    Kind.FLIGHT, Kind.POSE, Kind.STATUS, Kind.LOG, Kind.PLACES, Kind.PATH, Kind.AUTOPILOT,
-    Kind.COARSE, Kind.FINE, Kind.PICTURE, Kind.DEPTH,
+    Kind.FLIGHT, Kind.POSE, Kind.STATUS, Kind.OBSTACLES, Kind.LOG, Kind.PLACES, Kind.PATH,
+    Kind.AUTOPILOT, Kind.COARSE, Kind.FINE, Kind.PICTURE, Kind.DEPTH,
 )  # fmt: skip
 PICTURES = (Kind.PICTURE, Kind.DEPTH)
 PICTURE_SHARE = 0.15
 """Share of the rate for pictures until the map is complete; then they get the rest."""
 MOST_CREDIT_BYTES = 20_000
 POSE_SHARE, POSE_BYTES = 0.15, 120
+OBSTACLES_SHARE, OBSTACLES_BYTES = 0.05, 900
 MOST_POSES_HZ, LEAST_POSES_HZ = 30.0, 2.0
 POSES_BESIDE_HZ = 2.0
 """Rate of poses on the connection where datagrams get through."""
 STATUS_EVERY_S, ALIVE_EVERY_S = 1.0, 0.5
-PICTURES_HZ = 15.0
+PICTURES_HZ, OBSTACLES_HZ = 15.0, 10.0
 PLACES_AT_ONCE = 40
 PIECE_S = 0.02
 LEAST_PIECE, MOST_PIECE = 1000, 16_000
@@ -114,7 +115,7 @@ class Session:
     @property
     def n_waiting(self) -> int:
         """Number of map items not yet sent."""
-        return sum(len(self._waiting[kind]) for kind in ORDER[3:-2])
+        return sum(len(self._waiting[kind]) for kind in ORDER[4:-2])
 
     @property
     def is_complete(self) -> bool:
@@ -195,6 +196,8 @@ class Session:
             return 1.0 / POSES_BESIDE_HZ if self.datagrams_work else self._pose_every_s()
         if kind is Kind.STATUS:
             return STATUS_EVERY_S
+        if kind is Kind.OBSTACLES:
+            return max(1.0 / OBSTACLES_HZ, OBSTACLES_BYTES / (OBSTACLES_SHARE * rate))
         return 1.0 / PICTURES_HZ if kind in PICTURES else 0.0
 
     def _pose_every_s(self) -> float:

@@ -18,6 +18,7 @@ from companion.messages import (
     Georeference,
     KeyframeAdded,
     MapUpdate,
+    ObstaclesSeen,
     Odometry,
     PointChunk,
 )
@@ -94,6 +95,14 @@ def cloud_envelope(flight: str, chunk: PointChunk, update: MapUpdate | None) -> 
         "normals_camera": chunk.normals_camera, "sigma": chunk.sigma,
         "span_ids": np.array([*chunk.spans], "<i8"),
         "span_lengths": np.array([*chunk.spans.values()], "<f8"),
+    })  # fmt: skip
+
+
+def obstacles_envelope(flight: str, seen: ObstaclesSeen) -> Envelope:
+    """Topic `obstacles`: where the nearest things are, and how far it is free."""
+    return Envelope("obstacles", {"flight": flight, "t_ns": seen.t_ns}, {
+        "eye_world": seen.eye_world, "edges_world": seen.edges_world,
+        "free_world": seen.free_world,
     })  # fmt: skip
 
 

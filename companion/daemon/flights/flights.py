@@ -11,15 +11,14 @@ from pathlib import Path
 from companion.config import Config
 from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.kept_map_place import kept_map_path
-from companion.daemon.flights.live_flight import Listener, LiveFlight
-from companion.flight_notes import FlightNote
+from companion.daemon.flights.live_flight import Listener, LiveFlight, Taken
 from companion.geometry.camera import Camera
-from companion.messages import Frame, FrameOverdue, Warned
+from companion.messages import Frame
 from companion.messages.run_facts import RunFacts
 from companion.products.newest_file import NewestFile
 from companion.runtime.stage_protocol import KeepMap
 from companion.runtime.stage_start import Start
-from companion.telemetry import ArmedSample, Telemetry
+from companion.telemetry import ArmedSample
 from companion.timing.clock import FlightClock
 from drivers.recording.flights_folder import COUNTER, UNARMED, flight_name, next_number
 from drivers.system.journal import WARNING, Journal
@@ -136,8 +135,8 @@ class Flights:
         if flight is not None:
             flight.frame(frame)
 
-    def take(self, message: Telemetry | Warned | FrameOverdue | FlightNote) -> None:
-        """Take telemetry, a warning, a missing frame, or a note for the recorder."""
+    def take(self, message: Taken) -> None:
+        """Take what does not come of the flight's stages, but for frames."""
         if isinstance(message, ArmedSample):
             self._armed = message.armed
         if self.current is not None:

@@ -25,6 +25,7 @@ from companion.messages import (
     Georeferenced,
     LandingTarget,
     MapUpdate,
+    ObstaclesSeen,
     Odometry,
     OpticalFlow,
     PointChunk,
@@ -62,6 +63,7 @@ NOT_DENSE = "the dense map cannot be begun now; switch it off and on to try agai
 NOT_FINISHED = "a stage did not give its last results in time"
 HEALTH_EVERY_NS = 1_000_000_000
 GATHER_NS = round(GATHER_S * 1e9)
+Taken = Telemetry | Warned | FrameOverdue | FlightNote | ObstaclesSeen
 Given = Odometry | OpticalFlow | LandingTarget | Georeferenced | Snapshot
 GIVEN = {kind.__name__ for kind in get_args(Given)}
 MAPPED = {kind.__name__ for kind in (Track, MapUpdate, DepthMap, PointChunk)}
@@ -165,8 +167,8 @@ class LiveFlight:
             self.n_frames += 1
             self._processes.publish(Parcel.of(frame))
 
-    def take(self, message: Telemetry | Warned | FrameOverdue | FlightNote) -> None:
-        """Take telemetry, a warning, a missing frame or a note for the recorder; never waits."""
+    def take(self, message: Taken) -> None:
+        """Take what does not come of its stages, but for frames; never waits."""
         if not self._takes:
             return
         if not isinstance(message, LinkBytes):

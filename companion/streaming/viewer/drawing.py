@@ -1,6 +1,7 @@
 """Items to Rerun entities. To be called from one thread.
 
 world                       local NED in metres (z down)
+  obstacles, free           edges across the line of sight, where the autopilot is told of them
   autopilot/<n>             the autopilot's own path, in pieces
   camera                    the camera now, with its image and the points found in it; not below
                             the map, whose scale no pinhole may have above it
@@ -33,6 +34,7 @@ from companion.streaming.items import (
     FlightItem,
     Item,
     LogItem,
+    ObstaclesItem,
     PathItem,
     PictureItem,
     PlacesItem,
@@ -69,6 +71,10 @@ SERIES = {
 COLOUR_PATH = [255, 176, 32]
 COLOUR_AUTOPILOT = [120, 150, 255]
 COLOUR_FOUND = [80, 230, 120]
+COLOUR_FREE = [60, 150, 90]
+COLOURS_NEAR = (3.0, [255, 60, 50]), (6.0, [255, 130, 40]), (np.inf, [250, 210, 70])
+"""Distances of obstacles, metres, up to which they have a colour: three metres are about what a
+multicopter needs to stop from 4 m/s."""
 EARTH_EVERY_NS = 500_000_000
 EARTH_MOVED_M = 0.2
 """A piece of the path on the earth is drawn again where its keyframe has moved by more: most
@@ -148,6 +154,8 @@ class Drawing:
                 self._plot(f"kernels/{kernel.replace(' ', '-')}", ms)
             image = rr.EncodedImage(contents=item.image, media_type=item.media_type)
             self._rec.log("depth", image)
+        elif isinstance(item, ObstaclesItem):
+            self._obstacles(item)
         elif isinstance(item, SparseItem):
             sparse = rr.Points3D(item.points_map, radii=rr.Radius.ui_points(1.0))
             self._rec.log("world/map/sparse", sparse)
@@ -167,6 +175,17 @@ class Drawing:
         if pose is not None:
             self._rec.log("world/camera", _transform(Similarity(1.0, *_parts(pose))))
             self._on_earth(item.t_ns, pose)
+
+    def _obstacles(self, item: ObstaclesItem) -> None:
+        away_m = np.linalg.norm(item.edges_world.mean(1) - item.eye_world, axis=1)
+        colours = [next(c for most_m, c in COLOURS_NEAR if each <= most_m) for each in away_m]
+        for name, edges, colour in (
+            ("obstacles", item.edges_world, colours), ("free", item.free_world, COLOUR_FREE),
+        ):  # fmt: skip
+            width = rr.Radius.ui_points(3.0 if name == "obstacles" else 1.5)
+            self._rec.log(
+                f"world/{name}", rr.LineStrips3D(list(edges), colors=colour or None, radii=width)
+            )
 
     def _picture(self, item: PictureItem) -> None:
         if self._live and self._width and item.width != self._width:

@@ -33,7 +33,7 @@ def layout(*, live: bool) -> rrb.Blueprint:
             rrb.Horizontal(
                 rrb.Spatial3DView(
                     origin="world",
-                    name="Map (our path is orange, the autopilot's blue)",
+                    name="Map (path: ours orange, the autopilot's blue; near things red to yellow)",
                     contents=["+ $origin/**", "- /world/map/sparse"],
                     background=BACKGROUND,
                     line_grid=False,

@@ -25,6 +25,7 @@ from companion.messages import (
     Frame,
     Georeference,
     MapUpdate,
+    ObstaclesSeen,
     PixelState,
     PointChunk,
     Track,
@@ -75,10 +76,13 @@ class Heard(ObstacleReports):
         self.steps: list[GateStep] = []
         self.points: list[ObstaclePoints] = []
         self.sent: list[Any] = []
+        self.shown: list[ObstaclesSeen] = []
         super().__init__(config, link, clock, self._keep)
 
-    def _keep(self, note: GateStep | ObstaclePoints) -> None:
-        if isinstance(note, GateStep):
+    def _keep(self, note: GateStep | ObstaclePoints | ObstaclesSeen) -> None:
+        if isinstance(note, ObstaclesSeen):
+            self.shown.append(note)
+        elif isinstance(note, GateStep):
             self.steps.append(step_of(note.t_ns, decision_bytes(note)))
         else:
             self.points.append(points_of(note.t_ns, obstacle_points_bytes(note)))
@@ -289,6 +293,34 @@ def test_images_alone_tell_of_a_pole_and_of_free_space() -> None:
     reports._clock.t_ns += MAX_AGE_NS  # type: ignore[attr-defined]
     (message,) = reports.told()
     assert set(message.distances) == {UNKNOWN}
+
+
+@pytest.mark.parametrize("in_space", [False, True])
+def test_viewers_are_shown_where_the_pole_stands(in_space: bool) -> None:
+    """In the world; and nothing, once, when nothing is known any more."""
+    _, reports = looked("ardupilot", in_space=in_space)
+    eye = np.array([0.0, 0.08 * 11 - 0.88, -3.0])
+    shown = reports.shown[-1]
+    assert shown.eye_world == pytest.approx(eye, abs=1e-6)
+    assert len(shown.edges_world) and not len(shown.free_world)
+    middles = shown.edges_world.mean(1)
+    assert np.linalg.norm((middles - [6.0, 0.8, -3.0])[:, :2], axis=1).min() < 0.6
+    reports._clock.t_ns += MAX_AGE_NS  # type: ignore[attr-defined]
+    n_before = len(reports.shown)
+    reports.told()
+    reports.told()
+    (last,) = reports.shown[n_before:]
+    assert not len(last.edges_world) and not len(last.free_world)
+
+
+def test_viewers_are_shown_free_space_as_px4_is_told() -> None:
+    (message,), reports = looked("px4")
+    shown = reports.shown[-1]
+    free = (shown.free_world - shown.eye_world).mean(1)
+    sectors = np.round(np.degrees(np.arctan2(free[:, 1], free[:, 0])) / 5.0) % 72
+    is_free = np.array(message.distances) == round(100 * FREE_M) + 1
+    assert sorted(sectors) == np.flatnonzero(is_free).tolist() != []
+    assert np.hypot(free[:, 0], free[:, 1]) == pytest.approx(FREE_M)
 
 
 def test_in_space_ardupilot_is_told_where_the_pole_stands() -> None:

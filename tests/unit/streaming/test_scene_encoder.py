@@ -5,11 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from companion.errors import StreamError
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.health import ComputerLoad, FeedbackHealth, Health, SourceHealth
-from companion.messages import Floats, MapUpdate, Message, PointChunk, Track, TrackState, Warned
+from companion.messages import (
+    Floats,
+    MapUpdate,
+    Message,
+    ObstaclesSeen,
+    PointChunk,
+    Track,
+    TrackState,
+    Warned,
+)
 from companion.products.flight_result import FlightResult
 from companion.streaming.item_codec import decode
 from companion.streaming.items import (
@@ -17,6 +27,7 @@ from companion.streaming.items import (
     ImageItem,
     Item,
     LogItem,
+    ObstaclesItem,
     PathItem,
     PlacesItem,
     PointsItem,
@@ -53,6 +64,22 @@ def test_each_state_of_the_tracker_has_its_word() -> None:
     assert said == [
         ("Tracker: tracking", False), ("Tracker: coasting", True), ("Tracker: lost", True)
     ]  # fmt: skip
+
+
+def test_obstacles_come_as_they_are_to_a_centimetre() -> None:
+    rng = np.random.default_rng(3)
+    eye = np.array([120.0, -3.5, -12.0], np.float32)
+    near, free = (eye + rng.uniform(-20, 20, (n, 2, 3)).astype(np.float32) for n in (5, 2))
+    (item,) = told([ObstaclesSeen(7, eye, near, free)])
+    ((kind, _, payload),) = parts_of(item)
+    back = decode(kind, payload)
+    assert isinstance(back, ObstaclesItem) and back.t_ns == 7
+    assert np.array_equal(back.eye_world, eye)
+    assert back.edges_world == pytest.approx(near, abs=0.006)
+    assert back.free_world == pytest.approx(free, abs=0.006)
+    assert len(payload) < 120
+    with pytest.raises(StreamError):
+        decode(kind, payload[:-3])
 
 
 def test_who_was_never_tracked_is_lost_at_once() -> None:

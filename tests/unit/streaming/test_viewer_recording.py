@@ -14,7 +14,7 @@ from rerun.chunk import RrdReader
 
 from companion.config import ViewerConfig
 from companion.geometry.camera import Camera
-from companion.messages import Message, TrackState
+from companion.messages import Message, ObstaclesSeen, TrackState
 from companion.streaming.viewer import FileViewer, rrd_files
 from tests.support.flights import flown
 
@@ -46,10 +46,19 @@ def record(path: Path, messages: list[Message], config: ViewerConfig | None = No
     return rows
 
 
+NEAR = np.array([[[9, 1, -5], [9, 2, -5]], [[3, 1, -5], [3, 2, -5]]], np.float32)
+NO_EDGES = NEAR[:0]
+EYE = np.array([1, 1, -5], np.float32)
+OBSTACLES = [
+    ObstaclesSeen(flown.time_ns(flown.N_FRAMES), EYE, NEAR, NEAR[:1] + 20),
+    ObstaclesSeen(flown.time_ns(flown.N_FRAMES + 1), EYE, NO_EDGES, NO_EDGES),
+]
+
+
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Rows:
     first: list[Message] = [flown.update()]  # metric from the start
-    messages = flown.messages()
+    messages = [*flown.messages(), *OBSTACLES]
     return record(tmp_path_factory.mktemp("rrd") / "flight.rrd", first + messages)
 
 
@@ -73,12 +82,13 @@ def pieces(rows: Rows, entity: str) -> list[np.ndarray]:
 def path_in_map(rows: Rows) -> list[np.ndarray]:
     """The same of the camera's path, whose pieces lie in the frames of keyframes."""
     out = []
+    below = "/world/map/keyframes/"
     entities = {e for e, c in rows if c == "LineStrips3D:strips" and rows[e, c]}
-    for name in sorted(entities, key=lambda name: int(name.rsplit("/", 1)[1])):
-        if name.startswith("/world/map/keyframes/"):
-            _, matrix, translation = transform(rows, name)
-            strips = rows[name, "LineStrips3D:strips"][-1][1]
-            out += [np.array(strip) @ matrix.T + translation for strip in strips]
+    names = [name for name in entities if name.startswith(below)]
+    for name in sorted(names, key=lambda name: int(name.rsplit("/", 1)[1])):
+        _, matrix, translation = transform(rows, name)
+        strips = rows[name, "LineStrips3D:strips"][-1][1]
+        out += [np.array(strip) @ matrix.T + translation for strip in strips]
     return out
 
 
@@ -87,6 +97,16 @@ def test_the_map_lies_where_the_georeference_says(flight: Rows) -> None:
     true = flown.WORLD_FROM_MAP
     assert np.allclose(matrix, true.scale * true.rotation, atol=1e-5)
     assert np.allclose(translation, true.translation, atol=1e-5)
+
+
+def test_obstacles_are_drawn_the_nearer_the_redder_and_go_again(flight: Rows) -> None:
+    shown, gone = flight["/world/obstacles", "LineStrips3D:strips"]
+    assert np.array(shown[1]) == pytest.approx(NEAR)
+    assert gone[1] in ([], None)
+    far, near = (c >> 8 & 0xFFFFFF for c in flight["/world/obstacles", "LineStrips3D:colors"][0][1])
+    assert (near >> 16) > (near >> 8 & 255) and (far >> 8 & 255) > (near >> 8 & 255)
+    (free, _) = flight["/world/free", "LineStrips3D:strips"]
+    assert np.array(free[1]) == pytest.approx(NEAR[:1] + 20)
 
 
 def test_no_static_transform_hides_one_that_changes(flight: Rows) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from companion.errors import StreamError
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Pose
-from companion.messages import Odometry, PointChunk, TrackState
+from companion.messages import ObstaclesSeen, Odometry, PointChunk, TrackState
 from companion.topics.camera_fields import camera_fields, camera_of
 from companion.topics.envelope import Envelope, unpack
 from companion.topics.image_jpeg import image_of, jpeg_of, size_of
@@ -20,6 +20,7 @@ from companion.topics.message_codec import (
     cloud_of_envelope,
     depth_envelope,
     map_envelope,
+    obstacles_envelope,
     pose_envelope,
 )
 from companion.topics.pose_rows import place_of, pose_of
@@ -61,6 +62,15 @@ def test_a_pose_is_as_documented() -> None:
     assert sigmas == [0.05, 0.02, 0.01, 0.04]
     lost = unpack(pose_envelope("f", Odometry(6, 124, TrackState.LOST, 2)).pack()).fields
     assert lost["world_from_body"] is None and lost["sigma_position_m"] is None
+
+
+def test_obstacles_are_as_documented() -> None:
+    edges = np.arange(12, dtype=np.float32).reshape(2, 2, 3)
+    seen = ObstaclesSeen(7, np.array([1, 2, -3], np.float32), edges, edges[:1] + 5)
+    envelope = unpack(obstacles_envelope("f", seen).pack())
+    assert (envelope.kind, envelope.fields["t_ns"]) == ("obstacles", 7)
+    for name in ("eye_world", "edges_world", "free_world"):
+        assert np.array_equal(envelope.arrays[name], getattr(seen, name))
 
 
 def test_a_cloud_says_where_it_lies_in_the_world() -> None:
