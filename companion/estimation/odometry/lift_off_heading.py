@@ -23,9 +23,10 @@ AVERAGED_NS = 10_000_000_000
 """After a step; PX4's heading takes six to eight seconds to settle."""
 NEAR_M = 3.0
 """Level way from the lift-off within which turning about it moves the body but little."""
-STEP_RAD, STEP_NS = np.radians(1.5), 120_000_000
-"""Least change against ours in so short a time: the heading of PX4, which drifts as its motors
-start, changes by 12 degrees/s at most in its simulator."""
+STEP_RAD, DRIFT_RAD_NS = np.radians(1.5), np.radians(12.5) * 1e-9
+"""Least change against ours from one frame to the next, and more than comes in this time without a
+step: the heading of PX4, which drifts as its motors start, changes by 12 degrees/s at most in its
+simulator. A busy computer leaves frames out, and a step may come between."""
 
 
 class _LiftOff(NamedTuple):
@@ -99,9 +100,9 @@ class LiftOffHeading:
     def _average(self, t_ns: int, off_rad: float, may_step: bool) -> None:
         """Begin a mean with each step; else take another heading into that which has begun."""
         step, before = self._step, self._before
-        if before is not None and may_step and t_ns - before[0] <= STEP_NS:
+        if before is not None and may_step:
             change_rad = _within_half_turn(off_rad - before[1])
-            if abs(change_rad) > STEP_RAD:
+            if abs(change_rad) > max(STEP_RAD, DRIFT_RAD_NS * (t_ns - before[0])):
                 now_rad = before[1] + change_rad
                 self._step = _Step(t_ns, now_rad, 1)
                 return
