@@ -28,6 +28,7 @@ def take_off(trial: Trial, figures: Figures) -> None:
     """No GPS from power-on; up, hold, down."""
     stood = trial.ground.place_m
     if manoeuvres.up(trial, figures):
+        time.sleep(manoeuvres.SETTLE_S)
         manoeuvres.keep_place(trial, figures, "hold after take-off", 15.0)
         manoeuvres.land(trial, figures, stood)
 

@@ -27,6 +27,7 @@ from types import TracebackType
 from typing import Any
 
 from companion.errors import SourceError
+from tests.firmware.child import child
 from tests.firmware.ground import Ground
 from tests.firmware.perfect_pose import PerfectPose
 from tests.firmware.pilots import PILOTS, Pilot
@@ -296,24 +297,7 @@ class Trial:
     # -- within ----------------------------------------------------------------------------------
 
     def _child(self, module: str, *words: object) -> contextlib.AbstractContextManager[Any]:
-        command = [
-            "nice", "-n", str(self.conditions.nice), sys.executable, "-m",
-            f"tests.firmware.{module}", *map(str, words),
-        ]  # fmt: skip
-
-        @contextlib.contextmanager
-        def running() -> Any:
-            with (self.folder / f"{module}.txt").open("wb") as said:
-                process = subprocess.Popen(
-                    command, stdin=subprocess.PIPE, stdout=said, stderr=subprocess.STDOUT
-                )
-                try:
-                    yield process
-                finally:
-                    process.terminate()
-                    process.communicate()
-
-        return running()
+        return child(module, self.folder / f"{module}.txt", self.conditions.nice, *words)
 
     def _cable_between(self) -> contextlib.AbstractContextManager[Any]:
         log = self.folder / "cable.tlog"
