@@ -96,9 +96,11 @@ def head_path(mode: Mode, body: PathOf = path) -> PathOf:
     return ned_from_head
 
 
-def told_by_gimbal(mode: Mode, seconds: float, lie: Lie | None = None) -> list[GimbalSample]:
+def told_by_gimbal(
+    mode: Mode, seconds: float, lie: Lie | None = None, seed: int = 7
+) -> list[GimbalSample]:
     """Angles of the head as it tells them: noisy, and stamped late."""
-    rng, said = np.random.default_rng(7), []
+    rng, said = np.random.default_rng(seed), []
     for after_s in np.arange(-1.0, seconds, 1.0 / GIMBAL_HZ).tolist():
         level = rotation_from_quaternion(quaternion_from_euler(*angles_of(mode, after_s)))
         level = level @ rotation_from_vector(rng.normal(0.0, NOISE_RAD, 3))
@@ -116,20 +118,20 @@ def turned(sample: GimbalSample, yaw_rad: float) -> GimbalSample:
     return replace(sample, level_from_head=quaternion_from_rotation(rotation))
 
 
-def fly_with_gimbal(mode: Mode, seconds: float, lie: Lie | None = None) -> Flown:
+def fly_with_gimbal(mode: Mode, seconds: float, lie: Lie | None = None, *, seed: int = 3) -> Flown:
     """The flight with a gimbal."""
     return fly(
-        CAMERA, path, Terrain(3), seconds, RATE_HZ, ned_from_head=head_path(mode),
-        beside=told_by_gimbal(mode, seconds, lie),
+        CAMERA, path, Terrain(seed), seconds, RATE_HZ, ned_from_head=head_path(mode),
+        beside=told_by_gimbal(mode, seconds, lie, seed + 4),
     )  # fmt: skip
 
 
-def fly_fixed(seconds: float) -> Flown:
+def fly_fixed(seconds: float, seed: int = 3) -> Flown:
     """The same flight with the camera fixed, where the gimbal has it on the average."""
     looks = rotation_from_quaternion(quaternion_from_euler(0.0, float(DOWN_RAD), 0.2))
     inside = Pose(looks @ IN_HEAD.rotation, PLACE_BODY_M + looks @ IN_HEAD.translation)
     camera = replace(CAMERA, body_from_camera=inside, gimbal=None)
-    return fly(camera, path, Terrain(3), seconds, RATE_HZ)
+    return fly(camera, path, Terrain(seed), seconds, RATE_HZ)
 
 
 def body_errors(odometry: list[Odometry], body: PathOf = path) -> tuple[Array, Array]:
