@@ -1,8 +1,9 @@
 """The filter of the body's motion: one state with its covariance, and all that corrects it.
 
-Rotations are those of the autopilot, which integrates its gyroscopes itself; given them, place,
-velocity, the accelerometers' bias and the tilt are linear, and a Kalman filter of these has no
-point of linearisation to be wrong about (the same model finds the scale, see `inertial_scale`).
+Rotations are given: their heading is the autopilot's, their level that of `SteadyLevel`. So place,
+velocity, the accelerometers' bias, the tilt and its drift are linear, and a Kalman filter of these
+has no point of linearisation to be wrong about (the same model finds the scale, see
+`inertial_scale`).
 Where no accelerations are to be had, or to be believed, the velocity is held.
 """
 
@@ -28,9 +29,11 @@ from companion.estimation.body.aiding import (
 from companion.estimation.body.body_state import (
     BAROMETER,
     DOWN,
+    DRIFT,
     GROUND,
     N_STATE,
     SCALE,
+    SIGMA_DRIFT_M_S3,
     BodyState,
     carried_on,
     held,
@@ -134,6 +137,10 @@ class BodyFilter:
         self._waiting.append(measured)
         self._take_waiting()
 
+    def turn(self, t_ns: int, segment: int, map_from_body: Array) -> None:
+        """Learn of the gyroscopes from a rotation (3, 3) in a map, at a time by their stamps."""
+        self._integral.level.see(t_ns, segment, map_from_body)
+
     def lift_off(self, ground_down_m: float, sigma_m: float) -> None:
         """Take the ground that the body has lifted off, at a down coordinate."""
         self._state = self._state.with_part(GROUND, ground_down_m, sigma_m)
@@ -199,7 +206,8 @@ class BodyFilter:
         """
         self._take_waiting()
         end_ns = min(t_ns, self._integral.newest_ns)
-        if not self._begun or not self._integral.believed:
+        integral = self._integral
+        if not self._begun or not integral.believed or integral.level.contradicted:
             return None
         if t_ns - end_ns > MAX_HELD_NS or end_ns < self._state.t_ns:
             return None
@@ -331,6 +339,7 @@ class BodyFilter:
         if not state.covariance[BIAS, BIAS].any():
             state = state.with_part(BIAS, state.mean[BIAS], SIGMA_BIAS_M_S2)
             state = state.with_part(TILT, state.mean[TILT], SIGMA_TILT_M_S2)
+            state = state.with_part(DRIFT, state.mean[DRIFT], SIGMA_DRIFT_M_S3)
         state = _placed(state, place).with_part(VELOCITY, np.zeros(3), SIGMA_SPEED_M_S)
         self._state = state._replace(t_ns=place.t_ns, world_from_attitude=place.world_from_attitude)
         self._begun, self._refused_since_ns, self._aided_ns = True, None, place.t_ns

@@ -7,17 +7,26 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral, Change
-from companion.estimation.inertial.inertial_motion import BIAS, PLACE, TILT, VELOCITY, motion
+from companion.estimation.inertial.inertial_motion import (
+    BIAS,
+    PLACE,
+    SIGMA_TILT_M_S2,
+    TILT,
+    VELOCITY,
+    motion,
+)
 from companion.geometry.transforms import Array
 
-DOWN, GROUND, BAROMETER = PLACE.stop - 1, TILT.stop, TILT.stop + 1
+DRIFT = slice(TILT.stop, TILT.stop + 2)
+"""Change of the horizontal acceleration by tilt, m/s3: gyroscopes have a bias."""
+DOWN, GROUND, BAROMETER = PLACE.stop - 1, DRIFT.stop, DRIFT.stop + 1
 """Down coordinates, after the state of `motion`: of the ground below, of the barometer's zero."""
 SCALE = BAROMETER + 1
 """Logarithm of the map's metre over the true one. Its mean is 0: it is not corrected, but what it
 has made of the rest of the state is known, so that it is put right when a better scale comes."""
 N_STATE = SCALE + 1
-TILT_TAU_S = 20.0
-"""An autopilot's attitude is wrong otherwise after each manoeuvre."""
+SIGMA_DRIFT_M_S3, DRIFT_TAU_S = 0.003, 200.0
+"""By a bias of a fiftieth of a degree per second."""
 BIAS_WALK_M_S2 = 1e-3
 """Random walk of the bias, m/s2 per root of a second: 0.06 in an hour, by warming."""
 RELIEF_M2_PER_M = 0.1
@@ -37,7 +46,7 @@ class BodyState(NamedTuple):
 
     The mean begins as that of `motion` does, place and velocity in metres of the map; then the
     heights of ground and barometer, and the map's scale. Those without a variance are not known.
-    `world_from_attitude` (3, 3) goes from the autopilot's NED axes to those of the places.
+    `world_from_attitude` (3, 3) goes from the axes of the attitude to those of the places.
     """
 
     t_ns: int
@@ -53,8 +62,9 @@ class BodyState(NamedTuple):
         mean[BAROMETER] += to_m[2] - about_m[2]
         change = np.eye(N_STATE)
         change[PLACE, PLACE] = change[VELOCITY, VELOCITY] = turn
-        change[TILT, TILT], change[GROUND, GROUND] = rotation[:2, :2], scale
-        for part in (VELOCITY, TILT):
+        change[TILT, TILT] = change[DRIFT, DRIFT] = rotation[:2, :2]
+        change[GROUND, GROUND] = scale
+        for part in (VELOCITY, TILT, DRIFT):
             mean[part] = change[part, part] @ mean[part]
         return BodyState(
             self.t_ns, mean, change @ self.covariance @ change.T,
@@ -119,13 +129,13 @@ class BodyState(NamedTuple):
 def propagated(state: BodyState, t_ns: int, integral: AccelerationIntegral) -> BodyState | None:
     """The state at a later time, by what accelerometers measured; None where that is missing."""
     change = integral.between(state.t_ns, t_ns)
-    return None if change is None else _changed(state, t_ns, change, integral.density_m_s2)
+    return None if change is None else _changed(state, t_ns, change, integral)
 
 
 def carried_on(state: BodyState, t_ns: int, integral: AccelerationIntegral) -> BodyState:
     """The state of the newest sample of accelerometers at a later time, were it to stay so."""
     dt_s = (t_ns - state.t_ns) * 1e-9
-    after = _changed(state, t_ns, integral.beyond(dt_s), integral.density_m_s2)
+    after = _changed(state, t_ns, integral.beyond(dt_s), integral)
     sigma_m_s2 = float(np.hypot(integral.sigma_m_s2, SIGMA_JERK_M_S3 * dt_s / 2.0))
     grown = np.zeros((N_STATE, 3))
     grown[PLACE] = 0.5 * dt_s * dt_s * sigma_m_s2 * np.eye(3)
@@ -133,16 +143,25 @@ def carried_on(state: BodyState, t_ns: int, integral: AccelerationIntegral) -> B
     return after._replace(covariance=after.covariance + grown @ grown.T)
 
 
-def _changed(state: BodyState, t_ns: int, change: Change, density_m_s2: float) -> BodyState:
-    """The state after a change that accelerometers of a noise density measured."""
-    found = motion(change, state.world_from_attitude, density_m_s2, TILT_TAU_S, N_STATE)
+def _changed(
+    state: BodyState, t_ns: int, change: Change, integral: AccelerationIntegral
+) -> BodyState:
+    """The state after a change that was measured."""
+    tilt_tau_s = 2.0 * (SIGMA_TILT_M_S2 / integral.level.walk_m_s2) ** 2
+    turn, dt = state.world_from_attitude, change.dt_s
+    found = motion(change, turn, integral.density_m_s2, tilt_tau_s, N_STATE)
+    for part, power, by in ((TILT, 1, 1.0), (VELOCITY, 2, 2.0), (PLACE, 3, 6.0)):
+        found.step[part, DRIFT] = dt**power / by * np.eye(part.stop - part.start, 2)
+    kept = float(np.exp(-dt / DRIFT_TAU_S))
+    found.step[DRIFT, DRIFT] = kept * np.eye(2)
+    found.noise[DRIFT, DRIFT] = SIGMA_DRIFT_M_S3**2 * (1.0 - kept**2) * np.eye(2)
     mean = found.step @ state.mean
     mean[PLACE] += found.moved_m
     mean[VELOCITY] += found.gained_m_s
     step = found.step
     gained_m_s = mean[VELOCITY] - state.mean[VELOCITY]
     step[VELOCITY, SCALE] = gained_m_s
-    step[PLACE, SCALE] = mean[PLACE] - state.mean[PLACE] - change.dt_s * state.mean[VELOCITY]
+    step[PLACE, SCALE] = mean[PLACE] - state.mean[PLACE] - dt * state.mean[VELOCITY]
     covariance = step @ state.covariance @ step.T + found.noise
     return _walked(state, state._replace(t_ns=t_ns, mean=mean, covariance=covariance))
 

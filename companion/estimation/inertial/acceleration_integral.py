@@ -1,4 +1,7 @@
-"""Integrals of the measured acceleration in NED, by accelerometers and the autopilot's attitude.
+"""Integrals of the measured acceleration in NED, by accelerometers and a given attitude.
+
+Its heading is the autopilot's, its level by gyroscopes whose bias is known (`SteadyLevel`); where a
+gimbal's head is what the integrals are of, all of it is the autopilot's.
 
 Between two times they give the change of velocity and the displacement that an unbiased
 accelerometer measured, and how a bias in body axes changes both: preintegration (Forster et al.,
@@ -13,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.estimation.inertial.steady_level import SteadyLevel
 from companion.estimation.inertial.turn_integral import TurnIntegral
 from companion.estimation.sample_series import SampleSeries
 from companion.geometry.transforms import Array, rotation_from_quaternion
@@ -54,6 +58,8 @@ class AccelerationIntegral:
         """False while nobody knows yet whether the samples are right."""
         self.turns = TurnIntegral()
         """Of the same samples, without the attitude; of a body that turns as the camera does."""
+        self.level = SteadyLevel(self.turns)
+        """Of such a body, too."""
         self._waiting: deque[ImuSample] = deque(maxlen=1000)
         self._attitudes: tuple[AttitudeSample, ...] = ()
         self._series = SampleSeries()
@@ -88,6 +94,7 @@ class AccelerationIntegral:
         self._series.drop_since(since_ns)
         self.turns.withdraw(since_ns)
         self._waiting.clear()
+        self.level.reset()
         self._last = None
 
     @property
@@ -172,7 +179,11 @@ class AccelerationIntegral:
                 continue
             share = (sample.t_ns - before.t_ns) / span_ns
             rotation = rotation_from_quaternion(first + share * (second - first))
-            if self._lever_body_m is not None:
+            if self._lever_body_m is None:
+                if self._last is None or sample.t_ns - self._last[0] > MAX_GAP_NS:
+                    self.level.reset()
+                rotation = self.level.of(sample.t_ns, sample.gyro_rad_s, rotation)
+            else:
                 self._lever[0] = rotation @ np.cross(sample.gyro_rad_s, self._lever_body_m)
                 self._lever[1] = rotation @ self._lever_body_m
             self._add(sample.t_ns, rotation @ sample.accel_m_s2 + GRAVITY_NED_M_S2, rotation)

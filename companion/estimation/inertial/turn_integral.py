@@ -15,12 +15,17 @@ MAX_GAP_NS = 100_000_000
 MAX_SAMPLES = 32768
 """Nearly three minutes at 200 a second, 3 MB; the older half goes when they are full."""
 _IDENTITY = np.eye(3)
+INTERVAL_TAU, REGULAR = 500, 0.2
+"""Samples over which their interval is averaged, and by which ratio of it stamps of such that come
+regularly are off: an autopilot's scheduler, and corrections of the link's clock."""
 
 
 class TurnIntegral:
     """Rotations at the times of the samples, in axes of the body at the first."""
 
     def __init__(self) -> None:
+        self.interval_s = 0.0
+        """Of samples that come regularly."""
         self._n = 0
         self._t_ns = np.zeros(MAX_SAMPLES, np.int64)
         self._rotations = np.zeros((MAX_SAMPLES, 3, 3))
@@ -45,7 +50,12 @@ class TurnIntegral:
             if step_ns > MAX_GAP_NS:
                 gaps += 1
             else:
-                turn = 0.5e-9 * step_ns * (self._rates[last] + rates)
+                dt_s = step_ns * 1e-9
+                self.interval_s = self.interval_s or dt_s
+                regular = regular_s(dt_s, self.interval_s)
+                if regular != dt_s:
+                    self.interval_s += (dt_s - self.interval_s) / INTERVAL_TAU
+                turn = 0.5 * regular * (self._rates[last] + rates)
                 rotation = rotation @ rotation_from_vector(turn)
         self._t_ns[self._n], self._rotations[self._n] = sample.t_ns, rotation
         self._rates[self._n], self._gaps[self._n] = rates, gaps
@@ -72,6 +82,11 @@ class TurnIntegral:
             self._rotations[at] @ rotations_from_vectors(turns), self._rates[at],
             np.where(known, self._gaps[at], -1),
         )  # fmt: skip
+
+
+def regular_s(dt_s: float, interval_s: float) -> float:
+    """Time between two samples: their interval, where stamps do not contradict it."""
+    return interval_s if abs(dt_s - interval_s) < REGULAR * interval_s else dt_s
 
 
 def rotations_from_vectors(vectors: Array) -> Array:

@@ -28,7 +28,7 @@ from companion.estimation.odometry.stand import Stand
 from companion.estimation.odometry.tracked_velocity import tracked_velocity
 from companion.estimation.odometry.tracking_quality import FoundAgain, quality_of
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, Pose
+from companion.geometry.transforms import Array, Pose, yaw_angle, yaw_rotation
 from companion.messages import Georeference, Odometry, Track, TrackState
 
 QUALITY_MARGIN = 1.5
@@ -203,6 +203,9 @@ class SmoothOdometry:
             course.reset()
         course.gate.clear()
         course.body.move(placed.rotation @ here.rotation.T, here.translation, placed.translation)
+        if attitude is not None:
+            turned = pose.rotation @ flown.camera_from_body.rotation
+            course.body.turn(attitude.t_ns, segment, turned)
         self._aid(track.t_ns, placed, georeference, noise_m)
         to_world = georeference.world_from_map
         found = tracked_velocity(
@@ -230,7 +233,8 @@ class SmoothOdometry:
         attitude, sigma_scale = self.reckoning.attitude, georeference.sigma_scale
         worse = self.reckoning.reckoned is not None and not self.reckoning.is_fair
         if attitude is not None and (worse or not self._course.rough(sigma_scale)):
-            turned = placed.rotation @ attitude.ned_from_body.T
+            # images err in tilt for seconds: by as much as shifts a body in them as well
+            turned = yaw_rotation(yaw_angle(placed.rotation @ attitude.ned_from_body.T))
             active = self._course.flown.placed
             segment = None if active is None else active.segment
             self._course.body.aid(AidedPlace(

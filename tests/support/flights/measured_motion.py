@@ -7,7 +7,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from companion.estimation.inertial.acceleration_integral import GRAVITY_NED_M_S2
-from companion.geometry.transforms import Array, quaternion_from_rotation, rotation_from_vector
+from companion.geometry.transforms import (
+    Array,
+    quaternion_from_rotation,
+    rotation_from_vector,
+    vector_from_rotation,
+)
 from companion.telemetry import AttitudeSample, ImuSample
 
 STEP_S = 0.01
@@ -63,4 +68,5 @@ class MeasuredMotion:
             a = (path(t_s + h) - 2 * path(t_s) + path(t_s - h)) / h**2
             noise = self._rng.normal(scale=self._sigma_m_s2, size=3)
             force = turn.T @ (a - GRAVITY_NED_M_S2) + self.bias_m_s2 + noise
-            yield ImuSample(t_ns, np.zeros(3), force if self._axes is None else self._axes @ force)
+            rates = vector_from_rotation(turned(t_s - h).T @ turned(t_s + h)) / (2.0 * h)
+            yield ImuSample(t_ns, rates, force if self._axes is None else self._axes @ force)

@@ -94,7 +94,7 @@ def test_a_vehicle_that_rocks_on_its_gear_does_not_move_nor_is_its_mount_wrong()
     unaided.go_on(2.5, sinks_m_s2, TILTED_RAD, None)
     aided.go_on(2.5, sinks_m_s2, TILTED_RAD, np.array([0.02, -0.07, 0.01]))
     assert np.linalg.norm(unaided.velocity_m_s[:2]) > 0.7 and unaided.velocity_m_s[2] > 0.2
-    assert np.linalg.norm(aided.velocity_m_s) < 0.1
+    assert np.linalg.norm(aided.velocity_m_s) < 0.13
     assert np.linalg.norm(aided.place_m - STOOD_M) < 0.12
     assert not aided.contradicted and aided.ground.lift_off_flow.agrees is None
 

@@ -286,7 +286,7 @@ def test_inertial_navigation_learns_by_how_much_it_was_off() -> None:
     assert np.abs(np.diff([north(each) for each in found]) - 0.2).max() < 0.03
     velocities = np.array([each.velocity_world_m_s for each in found], np.float64)
     off_m_s = np.abs(velocities[:, 0] - 2.0 * SPEED)
-    assert off_m_s[129] > 0.07 and off_m_s[131:].max() < 0.03
+    assert off_m_s[129] > 0.07 and off_m_s[131:].max() < 0.04
 
 
 @pytest.mark.parametrize(("scale", "is_taken"), [(1.0, True), (1.1, True), (2.0, False)])

@@ -341,8 +341,11 @@ def test_after_lift_off_it_follows_a_step_of_the_autopilots_heading(
     stood = place(vehicle.frames(20, standing=True))
     first = MapView(vehicle.t_ns + STEP_NS, Pose(np.eye(3), np.zeros(3)))
     vehicle.frames(20)
-    for at_m in np.linspace((0.0, 0.0, 0.0), (away_m, 0.0, -0.5), n_frames):
-        up = vehicle.frame(at_m, first=first)
+    gone = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, n_frames))
+    gains_m_s2 = away_m * np.diff(gone, 2, prepend=(0.0, 0.0)) / (STEP_NS * 1e-9) ** 2
+    for share, gain_m_s2 in zip(gone, gains_m_s2, strict=True):
+        at_m = share * np.array([away_m, 0.0, -0.5])
+        up = vehicle.frame(at_m, first=first, north_m_s2=gain_m_s2)
     away = place(up) - stood
     headings_rad, places = [], []
     for k in range(80):
