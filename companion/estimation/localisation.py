@@ -92,16 +92,16 @@ class LocalisationStage:
             camera.body_from_camera,
             sensors_only=config.feedback.gives_position,
         )
-        acceleration = AccelerationIntegral(
-            None if camera.gimbal is None else np.array(camera.gimbal.place_body_m)
-        )
+        lever_m = None if camera.gimbal is None else np.array(camera.gimbal.place_body_m)
+        reckoning = AccelerationIntegral(lever_m)
+        of_scale = AccelerationIntegral(lever_m, own_level=False)
         self._standing = Standing()
-        body = BodyFilter(acceleration)
+        body = BodyFilter(reckoning)
         self._smooth = SmoothOdometry(
             camera, config.feedback.max_jump_m, body, config.feedback.min_quality
         )
         self._georeferences = SegmentGeoreferences(
-            self._georeferencer, self._attitude, acceleration, camera.body_from_camera
+            self._georeferencer, self._attitude, of_scale, camera.body_from_camera
         )
         self._odometry = BodyOdometry(
             self._tracker, self._attitude, self._gimbal, self._motion, self._georeferencer,
@@ -110,7 +110,7 @@ class LocalisationStage:
         self._checks = AttitudeChecks(
             self._attitude, self._tracker, self._motion, self._georeferences, self._smooth
         )
-        self._imu = JudgedAcceleration(acceleration, self._withdraw_accelerations)
+        self._imu = JudgedAcceleration((reckoning, of_scale), self._withdraw_accelerations)
         flow = FlowMeter(camera)
         self._flow = FlowOfFrames(
             config.feedback.flow != "off" and self._gimbal is None, flow, self._smooth.ground,

@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=120.0)
     options = parser.parse_args()
     integral, standing = AccelerationIntegral(), Standing()
-    judged, body = JudgedAcceleration(integral, lambda _: None), BodyFilter(integral)
+    judged, body = JudgedAcceleration([integral], lambda _: None), BodyFilter(integral)
     samples_s = frames_s = 0.0
     n_frames, next_frame_s = 0, 1.0
     # those of 100 Hz, told so much faster

@@ -1,7 +1,7 @@
 """Integrals of the measured acceleration in NED, by accelerometers and a given attitude.
 
-Its heading is the autopilot's, its level by gyroscopes whose bias is known (`SteadyLevel`); where a
-gimbal's head is what the integrals are of, all of it is the autopilot's.
+It is the autopilot's, or its heading alone, with a level by gyroscopes whose bias is known
+(`SteadyLevel`); not where a gimbal's head is what the integrals are of.
 
 Between two times they give the change of velocity and the displacement that an unbiased
 accelerometer measured, and how a bias in body axes changes both: preintegration (Forster et al.,
@@ -49,17 +49,20 @@ class AccelerationIntegral:
     """Integrates what arrives; attitude and IMU may come in any order up to a few samples.
 
     The integrals are those of a place `lever_body_m` (3,) from the IMU, in the body: a gimbal's
-    head, which does not turn with the body.
+    head, which does not turn with the body. `own_level` is for dead reckoning: within seconds it is
+    the better one. A scale, which is found over minutes, is the better by the autopilot's, which
+    wanders about the true one.
     """
 
-    def __init__(self, lever_body_m: Array | None = None) -> None:
+    def __init__(self, lever_body_m: Array | None = None, own_level: bool = True) -> None:
         self._lever_body_m = lever_body_m
+        self._own_level = own_level and lever_body_m is None
         self.believed = True
         """False while nobody knows yet whether the samples are right."""
         self.turns = TurnIntegral()
         """Of the same samples, without the attitude; of a body that turns as the camera does."""
         self.level = SteadyLevel(self.turns)
-        """Of such a body, too."""
+        """Of such a body, too; it is used where the integral is by its own level."""
         self._waiting: deque[ImuSample] = deque(maxlen=1000)
         self._attitudes: tuple[AttitudeSample, ...] = ()
         self._series = SampleSeries()
@@ -179,11 +182,11 @@ class AccelerationIntegral:
                 continue
             share = (sample.t_ns - before.t_ns) / span_ns
             rotation = rotation_from_quaternion(first + share * (second - first))
-            if self._lever_body_m is None:
+            if self._own_level:
                 if self._last is None or sample.t_ns - self._last[0] > MAX_GAP_NS:
                     self.level.reset()
                 rotation = self.level.of(sample.t_ns, sample.gyro_rad_s, rotation)
-            else:
+            elif self._lever_body_m is not None:
                 self._lever[0] = rotation @ np.cross(sample.gyro_rad_s, self._lever_body_m)
                 self._lever[1] = rotation @ self._lever_body_m
             self._add(sample.t_ns, rotation @ sample.accel_m_s2 + GRAVITY_NED_M_S2, rotation)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.imu_verdict import ImuVerdict
@@ -44,34 +44,43 @@ class ByAcceleration:
 
 
 class JudgedAcceleration:
-    """Passes samples on to the integral; what the verdict does not allow is a gap there.
+    """Passes samples on to integrals; what the verdict does not allow is a gap there.
 
-    `withdraw` is called with the time since which accelerations were wrong, after the integral has
-    dropped them.
+    `withdraw` is called with the time since which accelerations were wrong, after the integrals
+    have dropped them.
     """
 
-    def __init__(self, integral: AccelerationIntegral, withdraw: Callable[[int], None]) -> None:
-        self._integral, self._withdraw = integral, withdraw
+    def __init__(
+        self, integrals: Sequence[AccelerationIntegral], withdraw: Callable[[int], None]
+    ) -> None:
+        self._integrals, self._withdraw = integrals, withdraw
         self._verdict = ImuVerdict()
         self._warnings: list[Warned] = []
-        integral.believed = False
+        self._believe(False)
 
     def take(self, sample: AttitudeSample | ImuSample) -> None:
         """Add a sample; samples of a kind come in order of time."""
         if isinstance(sample, AttitudeSample) or not self._verdict.fault:
-            self._integral.take(sample)
+            for each in self._integrals:
+                each.take(sample)
         change = self._verdict.take(sample)
         if change is not None:
             self._warnings.append(change.warning)
             if change.invalid_since_ns is not None:
-                self._integral.withdraw(change.invalid_since_ns)
+                for each in self._integrals:
+                    each.withdraw(change.invalid_since_ns)
                 self._withdraw(change.invalid_since_ns)
-        # what is left in the integral after a fault was found right before
-        self._integral.believed = self._verdict.believed or bool(self._verdict.fault)
+        # what is left in the integrals after a fault was found right before
+        self._believe(self._verdict.believed or bool(self._verdict.fault))
 
     def prune(self, before_ns: int, keyframes_ns: Array) -> None:
         """Drop integrals before a time, except at the times of keyframes (N,), sorted."""
-        self._integral.prune(before_ns, keyframes_ns)
+        for each in self._integrals:
+            each.prune(before_ns, keyframes_ns)
+
+    def _believe(self, believed: bool) -> None:
+        for each in self._integrals:
+            each.believed = believed
 
     def warnings(self) -> list[Warned]:
         """Changes of the verdict since the last call."""

@@ -361,7 +361,7 @@ def test_a_heading_that_swings_on_the_ground_is_not_the_imu(period_s: float, see
 
 def integrated(wrong: Wrong) -> tuple[AccelerationIntegral, list[int], list[Warned]]:
     integral, withdrawn = AccelerationIntegral(), list[int]()
-    acceleration = JudgedAcceleration(integral, withdrawn.append)
+    acceleration = JudgedAcceleration([integral], withdrawn.append)
     for each in altered(samples(weaving), wrong):
         acceleration.take(each)
     return integral, withdrawn, acceleration.warnings()
