@@ -94,7 +94,7 @@ class LocalisationStage:
         )
         lever_m = None if camera.gimbal is None else np.array(camera.gimbal.place_body_m)
         reckoning = AccelerationIntegral(lever_m)
-        of_scale = AccelerationIntegral(lever_m, own_level=False)
+        of_scale = AccelerationIntegral(lever_m, reckoning.turns)
         self._standing = Standing()
         body = BodyFilter(reckoning)
         self._smooth = SmoothOdometry(

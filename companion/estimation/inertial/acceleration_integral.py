@@ -49,17 +49,20 @@ class AccelerationIntegral:
     """Integrates what arrives; attitude and IMU may come in any order up to a few samples.
 
     The integrals are those of a place `lever_body_m` (3,) from the IMU, in the body: a gimbal's
-    head, which does not turn with the body. `own_level` is for dead reckoning: within seconds it is
-    the better one. A scale, which is found over minutes, is the better by the autopilot's, which
-    wanders about the true one.
+    head, which does not turn with the body. A level of its own is for dead reckoning: within
+    seconds it is the better one. A scale, which is found over minutes, is the better by the
+    autopilot's, which wanders about the true one: for that the `turns` of an integral that takes
+    each sample before are given.
     """
 
-    def __init__(self, lever_body_m: Array | None = None, own_level: bool = True) -> None:
+    def __init__(
+        self, lever_body_m: Array | None = None, turns: TurnIntegral | None = None
+    ) -> None:
         self._lever_body_m = lever_body_m
-        self._own_level = own_level and lever_body_m is None
+        self._own_level = turns is None and lever_body_m is None
         self.believed = True
         """False while nobody knows yet whether the samples are right."""
-        self.turns = TurnIntegral()
+        self.turns = TurnIntegral() if turns is None else turns
         """Of the same samples, without the attitude; of a body that turns as the camera does."""
         self.level = SteadyLevel(self.turns)
         """Of such a body, too; it is used where the integral is by its own level."""
@@ -81,7 +84,7 @@ class AccelerationIntegral:
         """Add a sample; samples of a kind come in order of time."""
         if isinstance(sample, ImuSample):
             self._see_noise(sample)
-            if self._lever_body_m is None:
+            if self._own_level:
                 self.turns.take(sample)
             self._waiting.append(sample)
         elif not self._attitudes or sample.t_ns > self._attitudes[-1].t_ns:

@@ -24,6 +24,18 @@ def features(normalised: Array) -> Features:
     )  # fmt: skip
 
 
+def found_of(
+    seen_a: Array, seen_b: Array, measured: Array, rng: np.random.Generator, seed: int
+) -> TwoViewGeometry | None:
+    """Geometry of normalised coordinates (N, 2), to which half a pixel of noise is added."""
+    seen_a, seen_b = (s + rng.normal(scale=0.5 / FOCAL_PX, size=s.shape) for s in (seen_a, seen_b))
+    index = np.arange(N)
+    return initialise(
+        features(seen_a), features(seen_b), index, index, FOCAL_PX, seed, (measured, np.eye(3)),
+        np.radians(1.0),
+    )  # fmt: skip
+
+
 def begun(way: float, wrong_share: float, seed: int) -> TwoViewGeometry | None:
     """Sideways motion over distant hills and closer objects: the geometry, if found."""
     rng = np.random.default_rng(seed)
@@ -34,12 +46,7 @@ def begun(way: float, wrong_share: float, seed: int) -> TwoViewGeometry | None:
     seen_b = points_b[:, :2] / points_b[:, 2:]
     wrong = rng.permutation(N)[: int(wrong_share * N)]
     seen_b[wrong] = seen_b[np.roll(wrong, 1)]
-    seen_a, seen_b = (s + rng.normal(scale=0.5 / FOCAL_PX, size=s.shape) for s in (seen_a, seen_b))
-    index = np.arange(N)
-    return initialise(
-        features(seen_a), features(seen_b), index, index, FOCAL_PX, seed, (TURN, np.eye(3)),
-        np.radians(1.0),
-    )  # fmt: skip
+    return found_of(seen_a, seen_b, TURN, rng, seed)
 
 
 @pytest.mark.parametrize("wrong_share", [0.0, 0.3])
@@ -114,12 +121,7 @@ def seen_with(measured: Array, seed: int) -> TwoViewGeometry | None:
     seen_a, depth = rng.uniform(-0.5, 0.5, (N, 2)), rng.uniform(8.0, 15.0, N)
     points_b = np.c_[seen_a, np.ones(N)] * depth[:, None] - [0.35, 0.0, 0.0]
     seen_b = points_b[:, :2] / points_b[:, 2:]
-    seen_a, seen_b = (s + rng.normal(scale=0.5 / FOCAL_PX, size=s.shape) for s in (seen_a, seen_b))
-    index = np.arange(N)
-    return initialise(
-        features(seen_a), features(seen_b), index, index, FOCAL_PX, seed, (measured, np.eye(3)),
-        np.radians(1.0),
-    )  # fmt: skip
+    return found_of(seen_a, seen_b, measured, rng, seed)
 
 
 @pytest.mark.parametrize("seed", range(5))
