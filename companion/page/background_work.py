@@ -10,10 +10,11 @@ import contextlib
 import json
 import sys
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from companion.errors import InputError
 from companion.page.daemon_watch import DaemonWatch
 from companion.page.facts import Facts
 
@@ -61,22 +62,22 @@ class BackgroundWork:
         """The work, if it is of this kind."""
         return self.work if self.work is not None and self.work.kind == kind else None
 
+    def result(self, kind: str) -> dict[str, Any] | None:
+        """Lines of the work, if it is of this kind and done."""
+        work = self.of(kind)
+        return work.told if work is not None and work.state == "done" else None
+
     def begin(
         self, kind: str, about: str, arguments: Sequence[str], after: Callable[[Work], None]
     ) -> None:
-        """Begin a command of companion with these arguments, while none runs.
+        """Begin a command of companion with these arguments; InputError while another runs.
 
         Configuration and socket are those of the daemon. `after` is called at its end.
         """
-        assert not self.is_busy
+        if self.is_busy and self.work is not None:
+            raise InputError(f"{NAMES[self.work.kind]} runs: stop it, or wait for it.")
         self.work = Work(kind, about)
         self._task = asyncio.create_task(self._run(self.work, arguments, after))
-
-    @property
-    def busy_with(self) -> str:
-        """Words for whoever would begin another."""
-        work = self.work
-        return f"{NAMES[work.kind]} runs: stop it, or wait for it." if work is not None else ""
 
     def cancel(self, kind: str) -> None:
         """End the work, if one of this kind runs."""
@@ -145,15 +146,19 @@ class BackgroundWork:
                         self._child.kill()
 
 
+async def _lines(stream: asyncio.StreamReader) -> AsyncIterator[bytes]:
+    """Lines of a process, but for those that are longer than any of ours."""
+    while True:
+        with contextlib.suppress(ValueError):
+            line = await stream.readline()
+            if not line:
+                return
+            yield line
+
+
 async def _told(stream: asyncio.StreamReader, work: Work) -> None:
     """Take the lines of JSON; others are passed over."""
-    while True:
-        try:
-            line = await stream.readline()
-        except ValueError:
-            continue  # longer than any of ours
-        if not line:
-            return
+    async for line in _lines(stream):
         with contextlib.suppress(ValueError):
             found = json.loads(line)
             if isinstance(found, dict):
@@ -162,13 +167,7 @@ async def _told(stream: asyncio.StreamReader, work: Work) -> None:
 
 async def _kept(stream: asyncio.StreamReader, said: deque[str]) -> None:
     """Keep the last lines."""
-    while True:
-        try:
-            line = await stream.readline()
-        except ValueError:
-            continue
-        if not line:
-            return
+    async for line in _lines(stream):
         text = line.decode(errors="replace").strip()
         if text:
             said.append(text)

@@ -10,10 +10,9 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
-from companion.errors import FlightError
 from companion.page.flown import SHOWN, FlownFlights
 from companion.page.views.replay_views import ReplayViews
-from companion.page.views.site import Form, Site
+from companion.page.views.site import Form, RefusedError, Site
 
 SANDBOX = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline' blob:; worker-src blob:;"
@@ -42,10 +41,7 @@ class FlightViews:
         ]
 
     async def _list(self, request: Request) -> Response:
-        try:
-            flights = await asyncio.to_thread(self._flown.all)
-        except FlightError as error:
-            return await self._site.refused(request, str(error), 404)
+        flights = await asyncio.to_thread(self._flown.all)
         free_mb = await asyncio.to_thread(self._flown.free_mb)
         return await self._site.render(
             request, "flights.html.j2", flights=flights[:MOST_SHOWN],
@@ -54,11 +50,8 @@ class FlightViews:
 
     async def _one(self, request: Request) -> Response:
         name = request.path_params["name"]
-        try:
-            flight = await asyncio.to_thread(self._flown.one, name)
-            files = await asyncio.to_thread(self._flown.files, name)
-        except FlightError as error:
-            return await self._site.refused(request, str(error), 404)
+        flight = await asyncio.to_thread(self._flown.one, name)
+        files = await asyncio.to_thread(self._flown.files, name)
         return await self._site.render(
             request, "flight.html.j2", flight=flight, **self._replays.values(name),
             files=[(file, quote(file), mb, SHOWN.get(Path(file).name, "")) for file, mb in files],
@@ -66,10 +59,7 @@ class FlightViews:
 
     async def _file(self, request: Request) -> Response:
         name, file = request.path_params["name"], request.path_params["file"]
-        try:
-            path = await asyncio.to_thread(self._flown.file, name, file)
-        except FlightError as error:
-            return await self._site.refused(request, str(error), 404)
+        path = await asyncio.to_thread(self._flown.file, name, file)
         if path.suffix == ".html":
             headers = {"Content-Security-Policy": SANDBOX}
             return FileResponse(path, media_type="text/html", headers=headers)
@@ -85,19 +75,13 @@ class FlightViews:
 
     async def _mark(self, request: Request, kept: bool) -> Response:
         name = request.path_params["name"]
-        try:
-            await asyncio.to_thread(self._flown.keep, name, kept)
-        except FlightError as error:
-            return await self._site.refused(request, str(error), 409)
+        await asyncio.to_thread(self._flown.keep, name, kept)
         said = f"{name} is kept." if kept else f"{name} may be deleted when the disk is full."
         return self._site.done(request, f"/flights/{name}", said)
 
     async def _delete(self, request: Request, form: Form) -> Response:
         name = request.path_params["name"]
         if self._replays.is_replayed(name):
-            return await self._site.refused(request, f"{name}: is being replayed", 409)
-        try:
-            await asyncio.to_thread(self._flown.delete, name)
-        except FlightError as error:
-            return await self._site.refused(request, str(error), 409)
+            raise RefusedError(f"{name}: is being replayed")
+        await asyncio.to_thread(self._flown.delete, name)
         return self._site.done(request, "/flights", f"{name} was deleted.")

@@ -13,10 +13,9 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from companion.config_file import load_config
-from companion.errors import CompanionError
 from companion.page.background_work import BackgroundWork, Work
 from companion.page.flown import FlownFlights
-from companion.page.views.site import Form, Site
+from companion.page.views.site import Form, RefusedError, Site
 
 KIND = "replay"
 MOST_LINES = 40
@@ -58,19 +57,15 @@ class ReplayViews:
 
     async def _begin(self, request: Request, form: Form) -> Response:
         name = request.path_params["name"]
-        if self._work.is_busy:
-            return await self._site.refused(request, self._work.busy_with, 409)
         settings = [line.strip() for line in form.get("settings", "").splitlines() if line.strip()]
         if form.get("depth") in ("true", "false"):
             settings.append(f"depth.enabled={form['depth']}")
-        try:
-            flight = await asyncio.to_thread(self._flown.one, name)
-            load_config(None, settings[:MOST_LINES], lambda _: None)
-        except CompanionError as error:
-            return await self._site.refused(request, str(error), 409)
+        flight = await asyncio.to_thread(self._flown.one, name)
+        load_config(None, settings[:MOST_LINES], lambda _: None)
         if flight.growing or len(settings) > MOST_LINES:
-            why = "It is still being recorded." if flight.growing else "Too many settings."
-            return await self._site.refused(request, why, 409)
+            raise RefusedError(
+                "It is still being recorded." if flight.growing else "Too many settings."
+            )
         folder = self._flown.folder / name
         out = next(o for k in itertools.count(1) if not (o := folder / f"replay-{k}").exists())
         arguments = ["replay", str(folder), "--out", str(out), "--json"]

@@ -15,12 +15,13 @@ from companion.config import Config
 from companion.config.keys import dump, listed_words_of, value_of_key, words_of
 from companion.config.passwords import HIDDEN, without_passwords
 from companion.daemon.control.reload import needs_restart
-from companion.errors import CompanionError, ConfigError
+from companion.errors import ConfigError
 from companion.page.setting_texts import PURPOSES, Setting, settings
 from companion.page.settings_file import Change, SettingsFile, shown_value, value_of_text
-from companion.page.views.site import Form, Site, is_number
+from companion.page.views.site import Form, RefusedError, Site, is_number
 
 SHOWN_CHANGES = 20
+BY_HAND = "companion was started by hand, and nothing would start it again: do so by hand."
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +76,7 @@ class SettingViews:
     async def _save(self, request: Request, form: Form) -> Response:
         to = form.get("to", "/settings")
         to = to if to in ("/settings", "/setup", "/settings?expert=1") else "/settings"
-        try:
-            now = dump(await asyncio.to_thread(self._site.facts.configured))
-        except ConfigError as error:
-            return await self._site.refused(request, str(error), 409)
+        now = dump(await asyncio.to_thread(self._site.facts.configured))
         wanted: dict[str, Any] = {}
         wrong: dict[str, str] = {}
         for name, text in form.items():
@@ -98,10 +96,7 @@ class SettingViews:
             return await self._page(request, dict(form), wrong, 422)
         if not wanted:
             return self._site.done(request, to, "Nothing was changed.")
-        try:
-            return await self.keep(request, to, wanted)
-        except CompanionError as error:
-            return await self._site.refused(request, str(error), 409)
+        return await self.keep(request, to, wanted)
 
     async def keep(self, request: Request, to: str, wanted: Mapping[str, Any]) -> Response:
         """Set keys in the file, and go to a view; ConfigError."""
@@ -110,18 +105,12 @@ class SettingViews:
 
     async def _undo(self, request: Request, form: Form) -> Response:
         number = form.get("number", "")
-        try:
-            changes = await asyncio.to_thread(
-                self._file.undo, int(number) if is_number(number) else -1
-            )
-        except CompanionError as error:
-            return await self._site.refused(request, str(error), 409)
+        changes = await asyncio.to_thread(self._file.undo, int(number) if is_number(number) else -1)
         return self._taken_over(request, "/settings", changes)
 
     async def _restart(self, request: Request, form: Form) -> Response:
         if not self._site.facts.supervised:
-            why = "companion was started by hand, and nothing would start it again: do so by hand."
-            return await self._site.refused(request, why, 409)
+            raise RefusedError(BY_HAND)
         self._site.watch.order("restart")
         return await self._site.render(request, "restart.html.j2")
 
@@ -138,10 +127,7 @@ class SettingViews:
         self, request: Request, given: Form, wrong: dict[str, str], status_code: int = 200
     ) -> Response:
         expert = "expert" in request.query_params or any(n.startswith("expert.") for n in given)
-        try:
-            config = await asyncio.to_thread(self._site.facts.configured)
-        except ConfigError as error:
-            return await self._site.refused(request, str(error), 409)
+        config = await asyncio.to_thread(self._site.facts.configured)
         groups = []
         purposes = {"Expert": tuple(get_type_hints(Config))} if expert else PURPOSES
         for purpose, sections in purposes.items():

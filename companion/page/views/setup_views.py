@@ -9,11 +9,10 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from companion.errors import ConfigError
 from companion.page.doctor_process import Doctor
 from companion.page.setup_steps import steps
 from companion.page.views.setting_views import SettingViews
-from companion.page.views.site import Form, Site
+from companion.page.views.site import Form, RefusedError, Site
 from drivers.camera.camera_devices import cameras
 from drivers.system.serial_devices import serial_devices
 
@@ -52,11 +51,8 @@ class SetupViews:
         ]
 
     async def _show(self, request: Request) -> Response:
-        try:
-            config = await asyncio.to_thread(self._site.facts.configured)
-            fields = {key: self._settings.fields(names) for key, names in NEEDED.items()}
-        except ConfigError as error:
-            return await self._site.refused(request, str(error), 409)
+        config = await asyncio.to_thread(self._site.facts.configured)
+        fields = {key: self._settings.fields(names) for key, names in NEEDED.items()}
         values = await self._values()
         return await self._site.render(
             request, "setup.html.j2", **values, fields=fields, router=ROUTER,
@@ -75,8 +71,7 @@ class SetupViews:
         return await self._site.render(request, "devices.html.j2", cameras=found, ports=ports)
 
     async def _examine(self, request: Request, form: Form) -> Response:
-        if self._doctor.is_busy:
-            return await self._site.refused(request, "They are being examined just now.", 409)
+        self._check_free()
         good = "error" not in await self._doctor.examine()
         said = "The parameters were examined." if good else "The parameters could not be examined."
         return self._site.done(request, "/setup#parameters", said, good)
@@ -89,18 +84,21 @@ class SetupViews:
         ]
         wanted = settable if form.get("all") else [name]
         if not settable or not set(wanted) <= set(settable):
-            return await self._site.refused(request, "Examine the parameters first.", 409)
-        if self._doctor.is_busy:
-            return await self._site.refused(request, "They are being examined just now.", 409)
+            raise RefusedError("Examine the parameters first.")
+        self._check_free()
         found = await self._doctor.examine(*wanted)
         if "error" in found:
-            return await self._site.refused(request, found["error"], 409)
+            raise RefusedError(found["error"])
         said = [f"{each['name']} is now {each['to']:g}" for each in found["written"]]
         said += [f"not set: {each}" for each in found["refused"]]
         said += [f"not stored: {found['not_stored']}"] if found["not_stored"] else []
         text = "; ".join(said) + ". " if said else "Nothing was set. "
         text += "Reboot the autopilot." if found["reboot_needed"] else ""
         return self._site.done(request, "/setup#parameters", text, good=not found["refused"])
+
+    def _check_free(self) -> None:
+        if self._doctor.is_busy:
+            raise RefusedError("They are being examined just now.")
 
     async def _values(self) -> dict[str, Any]:
         status = await self._site.watch.status()

@@ -13,6 +13,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 
 from companion import __version__
+from companion.errors import CompanionError, FlightError
 from companion.page.access import COOKIE, Access, Right, Session
 from companion.page.daemon_watch import DaemonWatch
 from companion.page.facts import Facts
@@ -28,8 +29,17 @@ MOST_SAID = 64
 """Messages that wait for the view that shows them."""
 MOST_DIGITS = 18
 """Of a number in a request: Python refuses to read thousands of them."""
+FOREIGN_FORM = "This form did not come from this page."
 OWN_SITE = ("same-origin", "none")
 """Values of Sec-Fetch-Site for forms of this page."""
+
+
+class RefusedError(Exception):
+    """A view is refused to its reader, who is told why."""
+
+    def __init__(self, why: str, status_code: int = 409) -> None:
+        super().__init__(why)
+        self.status_code = status_code
 
 
 class Site:
@@ -52,35 +62,49 @@ class Site:
         return self.access.session(request.cookies.get(COOKIE), peer)
 
     def looking(self, view: View) -> View:
-        """A view for whoever may look on."""
+        """A view for whoever may look on; RefusedError and errors of ours become its answer."""
 
         async def checked(request: Request) -> Response:
             if self.session(request).right < Right.LOOK:
                 if request.headers.get("accept", "").startswith("text/html"):
                     return RedirectResponse(f"/pair?to={quote(request.url.path)}", 303)
                 return PlainTextResponse("pair this device first, at /pair", 401)
-            return await view(request)
+            return await self._answer(request, view(request))
 
         return checked
 
     def changing(self, change: Change) -> View:
-        """A change by whoever may change things, with a form of this page, while disarmed."""
+        """A change by whoever may change things, with a form of this page, while disarmed.
+
+        It answers as one by `looking` does.
+        """
 
         async def checked(request: Request) -> Response:
             form = await read_form(request)
             session = self.session(request)
             if form is None or not is_same_origin(request):
-                return await self.refused(request, "This form did not come from this page.", 403)
+                raise RefusedError(FOREIGN_FORM, 403)
             if session.right < Right.CHANGE:
-                return await self.refused(request, LOOKS_ON, 403)
+                raise RefusedError(LOOKS_ON, 403)
             if not self.access.is_token(session, form.get("token", "")):
-                return await self.refused(request, "This form is an old one. Open it again.", 403)
+                raise RefusedError("This form is an old one. Open it again.", 403)
             if await self.watch.is_armed():
-                why = ARMED if not self.watch.problem else NOT_KNOWN
-                return await self.refused(request, why, 409)
+                raise RefusedError(ARMED if not self.watch.problem else NOT_KNOWN)
             return await change(request, form)
 
-        return checked
+        async def answered(request: Request) -> Response:
+            return await self._answer(request, checked(request))
+
+        return answered
+
+    async def _answer(self, request: Request, answer: Awaitable[Response]) -> Response:
+        try:
+            return await answer
+        except RefusedError as refused:
+            return await self.refused(request, str(refused), refused.status_code)
+        except CompanionError as error:
+            missing = isinstance(error, FlightError) and request.method != "POST"
+            return await self.refused(request, str(error), 404 if missing else 409)
 
     async def render(
         self, request: Request, template: str, status_code: int = 200, **values: Any
