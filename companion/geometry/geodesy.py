@@ -12,6 +12,8 @@ from companion.geometry.transforms import Array
 SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1 / 298.257223563
 ECCENTRICITY_2 = FLATTENING * (2 - FLATTENING)
+STANDARD_GRAVITY_M_S2 = 9.80665
+"""By the 3rd CGPM, 1901; on earth it is within 0.3 % of this."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import LinkConfig
+from companion.geometry.geodesy import STANDARD_GRAVITY_M_S2
 from companion.geometry.transforms import Array, quaternion_from_euler
 from companion.telemetry import (
     AirspeedSample,
@@ -25,7 +26,6 @@ from companion.telemetry import (
 from drivers.telemetry.gimbal_messages import GIMBAL_IDS
 from drivers.telemetry.telemetry_log import GeodeticFix
 
-STANDARD_GRAVITY = 9.80665
 SEA_LEVEL_KG_M3 = 1.225
 """Density of the air at sea level in the standard atmosphere (ISO 2533)."""
 GPS_RANGE_ERROR_M = 1.5
@@ -134,7 +134,7 @@ def _highres_imu(message: Any) -> Telemetry | None:
 
 def _scaled_imu(message: Any) -> Telemetry:
     gyro = np.array([message.xgyro, message.ygyro, message.zgyro]) * 1e-3
-    accel = np.array([message.xacc, message.yacc, message.zacc]) * (1e-3 * STANDARD_GRAVITY)
+    accel = np.array([message.xacc, message.yacc, message.zacc]) * (1e-3 * STANDARD_GRAVITY_M_S2)
     return ImuSample(0, gyro, accel)
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.geometry.geodesy import STANDARD_GRAVITY_M_S2
 from companion.geometry.transforms import Array, quaternion_from_euler
 from companion.messages import ClockReport, Warned
 from companion.telemetry import (
@@ -29,7 +30,7 @@ from companion.timing.stamp_filter import MAX_BOOT_NS, valid_stamps
 from drivers.telemetry.gpmf_camera import HEIGHTS, camera_fixes
 from drivers.telemetry.gpmf_records import GpmfError, read_streams
 from drivers.telemetry.gpmf_track import blocks_of
-from drivers.telemetry.mavlink_samples import FIX_3D, STANDARD_GRAVITY, height_from_pressure
+from drivers.telemetry.mavlink_samples import FIX_3D, height_from_pressure
 from drivers.telemetry.telemetry_log import GeodeticFix, LogContent, TelemetryCollector
 
 Times = NDArray[np.int64]
@@ -138,7 +139,7 @@ def _gps(row: Array) -> GeodeticFix | None:
 
 
 def _imu(row: Array) -> Telemetry:
-    return ImuSample(0, row[4:7], row[1:4] * STANDARD_GRAVITY)
+    return ImuSample(0, row[4:7], row[1:4] * STANDARD_GRAVITY_M_S2)
 
 
 def _pressure(row: Array) -> Telemetry | None:

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.geometry.geodesy import STANDARD_GRAVITY_M_S2
 from companion.geometry.transforms import Array
 
-GRAVITY_M_S2 = 9.80665
 LEAD_HZ = 0.02
 """Gain of the tilt, a fiftieth in a second: over a minute a drone's accelerations average out, and
 a stronger lead would turn the attitude by each of them. At first, where the bias is not known of a
@@ -52,7 +52,7 @@ def attitudes_by_imu(t_ns: NDArray[np.int64], gyro_rad_s: Array, accel_m_s2: Arr
     attitudes, rates = np.empty((len(t_ns), 4)), np.empty((len(t_ns), 3))
     steps_s = np.diff(t_ns, prepend=t_ns[0]) * 1e-9
     forces = np.linalg.norm(accel_m_s2, axis=1)
-    shows = np.abs(forces / GRAVITY_M_S2 - 1.0) < MAX_OFF_G
+    shows = np.abs(forces / STANDARD_GRAVITY_M_S2 - 1.0) < MAX_OFF_G
     downs = -accel_m_s2 / np.maximum(forces, 1e-9)[:, None]
     # plain numbers: two hundred samples a second, and arrays of three are slow
     since_s = 0.0

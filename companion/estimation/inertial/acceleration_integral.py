@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from companion.estimation.inertial.steady_level import SteadyLevel
 from companion.estimation.inertial.turn_integral import TurnIntegral
 from companion.estimation.sample_series import SampleSeries
+from companion.geometry.geodesy import STANDARD_GRAVITY_M_S2
 from companion.geometry.transforms import Array, rotation_from_quaternion
 from companion.telemetry import AttitudeSample, ImuSample
 
-GRAVITY_NED_M_S2 = np.array([0.0, 0.0, 9.80665])
-"""Standard gravity (CGPM 1901); what it differs by on earth, 0.3 %, counts as bias."""
+GRAVITY_NED_M_S2 = np.array([0.0, 0.0, STANDARD_GRAVITY_M_S2])
+"""Differences from it on earth count as bias."""
 MAX_GAP_NS = 100_000_000
 """Longer without a sample, nothing is integrated across."""
 NO_GAP = 1e-6

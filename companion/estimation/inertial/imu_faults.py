@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.estimation.inertial.acceleration_integral import GRAVITY_NED_M_S2
 from companion.estimation.inertial.imu_comparison import ImuWindow
+from companion.geometry.geodesy import STANDARD_GRAVITY_M_S2
 from companion.geometry.transforms import Array
 
 LEAST_HZ = 25.0
 """Half of the least that the autopilot is asked for: as if a link lost every other sample."""
 RECENT_S, LEAST_SAMPLES = 2.0, 10
 """Time that is looked at, and samples that say anything."""
-LEAST_RAIL_M_S2 = 1.5 * 9.80665
+LEAST_RAIL_M_S2 = 1.5 * STANDARD_GRAVITY_M_S2
 """The narrowest range of accelerometers in autopilots is 2 g; a vehicle in rest measures 1 g."""
 AT_RAIL, NEAR_RAIL_M_S2 = 5, 0.3
 """Equal extremes of one axis; and what lies so near them, which at a rail is less than these."""
@@ -45,7 +45,7 @@ def fault(window: ImuWindow) -> str | None:
             return f"it is saturated: its {AXES[axis]} axis ends at {rail:+.1f} m/s2"
     size = float(np.linalg.norm(force, axis=1).mean())
     if IN_G[0] < size < IN_G[1]:
-        g = float(GRAVITY_NED_M_S2[2])
+        g = STANDARD_GRAVITY_M_S2
         return f"its accelerations are in g, not in m/s2: {size:.2f} instead of {g:.1f}"
     return None
 

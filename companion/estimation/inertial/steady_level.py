@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from companion.estimation.inertial.turn_integral import TurnIntegral, regular_s
+from companion.geometry.geodesy import STANDARD_GRAVITY_M_S2
 from companion.geometry.transforms import (
     Array,
     nearest_rotation,
@@ -50,7 +51,6 @@ WALK_M_S2, AUTOPILOT_WALK_M_S2 = 0.003, 0.03
 samples come, and by an autopilot's after each manoeuvre."""
 LED_HZ = 0.3
 """A gain that passes half of these on: manoeuvres last for seconds."""
-GRAVITY_M_S2 = 9.80665
 
 
 class SteadyLevel:
@@ -103,7 +103,7 @@ class SteadyLevel:
     def walk_m_s2(self) -> float:
         """Walk of the horizontal acceleration by an error of the level, per root of a second."""
         share = self.lead_hz**2 / (LED_HZ**2 + self.lead_hz**2)
-        by_noise = GRAVITY_M_S2 * float(np.sqrt(self._noise))
+        by_noise = STANDARD_GRAVITY_M_S2 * float(np.sqrt(self._noise))
         return float(np.linalg.norm([WALK_M_S2, by_noise, share * AUTOPILOT_WALK_M_S2]))
 
     def reset(self) -> None:

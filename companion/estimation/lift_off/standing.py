@@ -13,6 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from companion.geometry.geodesy import STANDARD_GRAVITY_M_S2
 from companion.geometry.transforms import Array, rotation_from_quaternion
 from companion.messages import Bytes
 from companion.telemetry import ArmedSample, AttitudeSample, ImuSample, LandedSample, Telemetry
@@ -49,7 +50,6 @@ TO_GO_ON = Limits(0.15, float(np.radians(4.0)), 1.0, 1.5, 2.0)
 """Motors that are started shake the vehicle on its gear, and its autopilot's attitude: PX4's turned
 by 1.2 degrees in its simulator, on the ground, the vehicle by 0.2. As long as the image hardly
 moves, and the autopilot says that it is on the ground, that is no lift-off."""
-GRAVITY_M_S2 = 9.80665
 WIDTH_PX = 160
 """Width of the compared images: noise is averaged away, and a blurred image shows as much."""
 MAX_GAIN_CHANGE = 0.3
@@ -134,7 +134,7 @@ class Standing:
         return (
             float(np.linalg.norm(gyro.mean(0))) < limits.turn_rad_s
             and change < limits.change_m_s2 + 2.0 * noise
-            and abs(weight - GRAVITY_M_S2) < limits.gravity_m_s2
+            and abs(weight - STANDARD_GRAVITY_M_S2) < limits.gravity_m_s2
         )
 
     def _attitude_still(self, t_ns: int, limits: Limits) -> bool:
