@@ -28,17 +28,11 @@ from companion.app.cli import (
     replaying,
     service_commands,
 )
-from companion.app.cli.options import Command
 from companion.app.stopping import StopSignals
 from companion.errors import CompanionError, InputError, StageError
 
 # In a command libraries are loaded late: they take a second, and --help needs none of them.
 FAMILIES = (flying, replaying, recordings, maps, hardware, measuring, service_commands)
-COMMANDS: dict[str, Command] = {
-    name: command for family in FAMILIES for name, command in family.COMMANDS.items()
-}
-
-
 OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 """Whatever file was to be written: no fault of the program, and the same for each command."""
 READER_GONE = 128 + signal.SIGPIPE
@@ -75,7 +69,7 @@ def _run(argv: Sequence[str] | None) -> int:
     arguments = command_parser().parse_args(argv)
     with StopSignals() as signals:
         try:
-            return COMMANDS[arguments.command](arguments, signals)
+            return int(arguments.does(arguments, signals))
         except KeyboardInterrupt:
             print("companion: stopped", file=sys.stderr)
             return signals.exit_status

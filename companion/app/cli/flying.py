@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from companion.app.cli.options import Command, configuration, json_option, names, viewer, within
+from companion.app.cli.options import command, configuration, json_option, names, viewer, within
 from companion.app.stopping import StopSignals
 from companion.config import Config
 from companion.config_file import load_config, to_toml
@@ -123,20 +123,15 @@ def _check_beyond(config: Config) -> None:
         check_calibration(config.camera, config.mount)
 
 
-COMMANDS: dict[str, Command] = {
-    "run": _run,
-    "status": _status,
-    "page": _page,
-    "support": _support,
-    "view": _view,
-    "check-config": _check_config,
-}
-
-
 def add_parsers(commands: Any) -> None:
     """Add them to the subparsers of the program."""
-    run = commands.add_parser(
-        "run", parents=[configuration()],
+    for add in (_add_run, _add_status, _add_support, _add_page, _add_view, _add_check_config):
+        add(commands)
+
+
+def _add_run(commands: Any) -> None:
+    run = command(
+        commands, "run", _run, parents=[configuration()],
         help="fly: camera, autopilot, map and pose, until stopped",
         description="The daemon on the drone. SIGTERM ends it, SIGHUP has it read its "
         "configuration again. With --stages depth,cloud it is a node on another machine, which "
@@ -151,11 +146,18 @@ def add_parsers(commands: Any) -> None:
         help="a node to join, as tcp/HOST:7447; can be given again",
     )  # fmt: skip
 
-    status = commands.add_parser(
-        "status", parents=[configuration(), json_option()], help="ask the running daemon how it is"
-    )
-    support = commands.add_parser(
-        "support", parents=[configuration()],
+
+def _add_status(commands: Any) -> None:
+    status = command(
+        commands, "status", _status, parents=[configuration(), json_option()],
+        help="ask the running daemon how it is",
+    )  # fmt: skip
+    status.add_argument("--watch", action="store_true", help="again every second until Ctrl-C")
+
+
+def _add_support(commands: Any) -> None:
+    support = command(
+        commands, "support", _support, parents=[configuration()],
         help="pack what a maintainer needs to help into one file",
         description="Pack versions, settings without passwords, health, journal, list of "
         "flights and the end of the newest recording into one .zip. Say what is in it, and what "
@@ -173,10 +175,11 @@ def add_parsers(commands: Any) -> None:
         "--seconds", type=within(0, 300), default=10.0, metavar="S",
         help="seconds of the newest recording, with its pictures; 0 for none (default: 10)",
     )  # fmt: skip
-    status.add_argument("--watch", action="store_true", help="again every second until Ctrl-C")
 
-    page = commands.add_parser(
-        "page", parents=[configuration()],
+
+def _add_page(commands: Any) -> None:
+    page = command(
+        commands, "page", _page, parents=[configuration()],
         help="show where the drone's page is, and the codes that pair a device with it",
         description="Show where the drone's page is, which `companion run` serves at page.listen. "
         "A browser on another machine needs one of the codes: the first to look on, the second to "
@@ -186,8 +189,10 @@ def add_parsers(commands: Any) -> None:
         "--new-codes", action="store_true", help="draw other codes: every paired device is out"
     )
 
-    view = commands.add_parser(
-        "view", help="watch a flight on the ground, over whatever link there is",
+
+def _add_view(commands: Any) -> None:
+    view = command(
+        commands, "view", _view, help="watch a flight on the ground, over whatever link there is",
         description="Connect to a companion that flies (its stream.listen) and show the map, the "
         "camera and how all is, until Ctrl-C; the link may come and go.",
     )  # fmt: skip
@@ -209,8 +214,10 @@ def add_parsers(commands: Any) -> None:
         help="what the colours of the cloud tell (default: %(default)s)",
     )  # fmt: skip
 
-    check = commands.add_parser(
-        "check-config", parents=[configuration()],
+
+def _add_check_config(commands: Any) -> None:
+    check = command(
+        commands, "check-config", _check_config, parents=[configuration()],
         help="print the configuration that would be used",
         description="Check a configuration and print the whole of it as TOML.",
     )  # fmt: skip

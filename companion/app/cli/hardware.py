@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from companion.app.cli.options import Command, configuration, json_option
+from companion.app.cli.options import command, configuration, json_option
 from companion.app.progress import JsonProgress, progress_on
 from companion.app.stopping import StopSignals
 from companion.config import Config
@@ -120,18 +120,16 @@ def _doctor(arguments: argparse.Namespace, signals: StopSignals) -> int:
     )  # fmt: skip
 
 
-COMMANDS: dict[str, Command] = {
-    "devices": _devices,
-    "calibrate": _calibrate,
-    "mount": _mount,
-    "doctor": _doctor,
-}
-
-
 def add_parsers(commands: Any) -> None:
     """Add them to the subparsers of the program."""
-    devices = commands.add_parser(
-        "devices", parents=[json_option()], help="list cameras, serial ports and OpenCL devices",
+    for add in (_add_devices, _add_calibrate, _add_mount, _add_doctor):
+        add(commands)
+
+
+def _add_devices(commands: Any) -> None:
+    devices = command(
+        commands, "devices", _devices, parents=[json_option()],
+        help="list cameras, serial ports and OpenCL devices",
         description="List what a configuration can name. OpenCL devices are tested and measured "
         "anew, and the result is kept for opencl.device = auto.",
     )  # fmt: skip
@@ -147,8 +145,10 @@ def add_parsers(commands: Any) -> None:
         "--verbose", action="store_true", help="with what drivers and their compilers say"
     )
 
-    calibrate = commands.add_parser(
-        "calibrate", parents=[configuration(), json_option()],
+
+def _add_calibrate(commands: Any) -> None:
+    calibrate = command(
+        commands, "calibrate", _calibrate, parents=[configuration(), json_option()],
         help="calibrate a camera by a board held before it",
         description="Find a camera's focal length, centre and distortion from views of a board; "
         "writes OUT/NAME.toml, for camera.calibration, and a picture beside it.",
@@ -180,8 +180,10 @@ def add_parsers(commands: Any) -> None:
         "--print-board", type=Path, metavar="FILE", help="only write the board, .pdf or .png"
     )
 
-    mount = commands.add_parser(
-        "mount", parents=[configuration(), json_option()],
+
+def _add_mount(commands: Any) -> None:
+    mount = command(
+        commands, "mount", _mount, parents=[configuration(), json_option()],
         help="find how the camera sits on the vehicle, by turning both",
         description="Compare rotations of the camera with those of the autopilot, in a recorded "
         "flight or while the vehicle is turned by hand; prints the lines of [mount].",
@@ -191,8 +193,10 @@ def add_parsers(commands: Any) -> None:
         "--running", action="store_true", help="of the running daemon, disarmed, while it is turned"
     )
 
-    doctor = commands.add_parser(
-        "doctor", parents=[configuration(), json_option()],
+
+def _add_doctor(commands: Any) -> None:
+    doctor = command(
+        commands, "doctor", _doctor, parents=[configuration(), json_option()],
         help="find the autopilot's parameters that keep it from using the pose",
         description="Read the autopilot's parameters over the configured link and name each that "
         "stands in the way. Exit status 1 where there is one.",

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from companion.app.cli.options import Command, amount, json_option, made_folder
+from companion.app.cli.options import amount, command, json_option, made_folder
 from companion.app.stopping import StopSignals
 from companion.errors import InputError
 
@@ -45,13 +45,10 @@ def _map(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return 0
 
 
-COMMANDS: dict[str, Command] = {"map": _map}
-
-
 def add_parsers(commands: Any) -> None:
     """Add the parsers of these commands."""
-    of_map = commands.add_parser(
-        "map", help="maps of sites that flights have left",
+    of_map = command(
+        commands, "map", _map, help="maps of sites that flights have left",
         description="Maps of sites: the site.map in the folder of a run or a flight.",
     )  # fmt: skip
     whats = of_map.add_subparsers(dest="what", required=True, metavar="WHAT")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.app.cli.options import (
-    Command,
+    command,
     configuration,
     depths,
     frames,
@@ -37,13 +37,11 @@ def _depth(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return 0
 
 
-COMMANDS: dict[str, Command] = {"depth": _depth}
-
-
 def add_parsers(commands: Any) -> None:
     """Add it to the subparsers of the program."""
-    depth = commands.add_parser(
-        "depth", parents=[configuration()], help="dense depth from images with known poses",
+    depth = command(
+        commands, "depth", _depth, parents=[configuration()],
+        help="dense depth from images with known poses",
         description="Reconstruct the depth of reference frames. DATASET is a folder in the layout "
         "of REMODE's test set or of TUM RGB-D, with poses.txt and K.txt, or a flight with "
         "trajectory.tum.",

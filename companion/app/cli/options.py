@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from companion.app.stopping import StopSignals
 from companion.config.keys import words_of
@@ -18,6 +19,13 @@ from companion.errors import InputError
 PROFILE = "computer.profile"
 Command = Callable[[argparse.Namespace, StopSignals], int]
 """Implementation of a command: arguments in, exit status out."""
+
+
+def command(commands: Any, name: str, does: Command, **options: Any) -> argparse.ArgumentParser:
+    """Add a command to the subparsers of the program, with options of its parser."""
+    parser: argparse.ArgumentParser = commands.add_parser(name, **options)
+    parser.set_defaults(does=does)
+    return parser
 
 
 def configuration() -> argparse.ArgumentParser:
@@ -64,6 +72,12 @@ def made_folder(path: Path | None) -> None:
     except OSError as error:
         why = error.strerror or error
         raise InputError(f"{path}: cannot be written: {why}; --out wants a folder") from error
+
+
+def check_span(start_s: float | None, stop_s: float | None) -> None:
+    """InputError where --stop is not after --start."""
+    if start_s is not None and stop_s is not None and stop_s <= start_s:
+        raise InputError(f"--stop {stop_s:g} is not after --start {start_s:g}")
 
 
 @contextmanager

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from companion.app.cli.options import (
-    Command,
     amount,
+    check_span,
+    command,
     configuration,
     count,
     held_folder,
@@ -41,8 +42,7 @@ def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
         path = flights.found_recording(arguments.flight, folder)
         print(flights.show_flight(path, arguments.json))
     elif what == "trim":
-        if None not in (arguments.start, arguments.stop) and arguments.stop <= arguments.start:
-            raise InputError(f"--stop {arguments.stop:g} is not after --start {arguments.start:g}")
+        check_span(arguments.start, arguments.stop)
         path = flights.found_recording(arguments.flight, folder)
         print(flights.trim_flight(path, arguments.start, arguments.stop, arguments.out, megabytes))
     elif what == "export":
@@ -143,14 +143,16 @@ def _batch(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return 1 if failed else 0
 
 
-COMMANDS: dict[str, Command] = {"flights": _flights, "compare": _compare, "batch": _batch}
-
-
 def add_parsers(commands: Any) -> None:
     """Add them to the subparsers of the program."""
-    _add_flights(commands)
-    compare = commands.add_parser(
-        "compare", help="what differs between two runs of a flight, or two maps of a site",
+    for add in (_add_flights, _add_compare, _add_batch):
+        add(commands)
+
+
+def _add_compare(commands: Any) -> None:
+    compare = command(
+        commands, "compare", _compare,
+        help="what differs between two runs of a flight, or two maps of a site",
         description="Compare the --out folders of two replays of one flight: poses, cloud, times. "
         "Exit status 1 where a limit is given and not kept. With --maps: what is gone, new or "
         "moved at a site between two flights.",
@@ -170,8 +172,11 @@ def add_parsers(commands: Any) -> None:
         help="limit: distance that 95 %% of points keep to the other cloud, metres",
     )  # fmt: skip
 
-    batch = commands.add_parser(
-        "batch", parents=[configuration()], help="replay an archive of flights on many cores",
+
+def _add_batch(commands: Any) -> None:
+    batch = command(
+        commands, "batch", _batch, parents=[configuration()],
+        help="replay an archive of flights on many cores",
         description="Replay each flight into a folder of DIR, and write DIR/index.html with a row "
         "for each. What is done already is not done again. Exit status 1 where a flight failed.",
     )  # fmt: skip
@@ -200,7 +205,7 @@ def _add_flights(commands: Any) -> None:
         help="folder of all flights (default: daemon.flights of the configuration given, else that "
         "of the installed service, else ./flights)",
     )  # fmt: skip
-    flights = commands.add_parser("flights", help="recordings of live flights")
+    flights = command(commands, "flights", _flights, help="recordings of live flights")
     does = flights.add_subparsers(dest="what", required=True, metavar="WHAT")
 
     does.add_parser("list", parents=[place, json_option()], help="list them")
@@ -236,6 +241,10 @@ def _add_flights(commands: Any) -> None:
     mission.add_argument(
         "flight", metavar="FLIGHT", help="name or folder of a flight, or what --out of a replay was"
     )
+    _add_upkeep(does, place)
+
+
+def _add_upkeep(does: Any, place: argparse.ArgumentParser) -> None:
     verify = does.add_parser(
         "verify", parents=[place], help="check all checksums",
         description="Check all checksums of recordings. Exit status 1 where one is damaged or cut "

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from companion.app.cli.options import (
-    Command,
+    check_span,
+    command,
     configuration,
     held_folder,
     json_option,
@@ -46,8 +47,7 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
     config = _with_telemetry(arguments)
     if arguments.map is not None:
         config = dataclasses.replace(config, map=MapConfig(use=str(arguments.map)))
-    if None not in (arguments.start, arguments.stop) and arguments.stop <= arguments.start:
-        raise InputError(f"--stop {arguments.stop:g} is not after --start {arguments.start:g}")
+    check_span(arguments.start, arguments.stop)
     if arguments.out.exists() and not arguments.out.is_dir():
         raise InputError(f"{arguments.out}: is a file; --out wants a folder")
     if config.export.formats:
@@ -148,52 +148,58 @@ def _export_into(run: Path, out: Path, config: Config, flight: Path | None) -> N
         print(f"export: {path}")
 
 
-COMMANDS: dict[str, Command] = {
-    "replay": _replay,
-    "demo": _demo,
-    "import": _import,
-    "export": _export,
-    "film": _film,
-}
-
-
 def add_parsers(commands: Any) -> None:
     """Add them to the subparsers of the program."""
-    timing = argparse.ArgumentParser(add_help=False)
-    timing.add_argument(
+    for add in (_add_replay, _add_demo, _add_import, _add_export, _add_film):
+        add(commands)
+
+
+def _timing() -> argparse.ArgumentParser:
+    """Options about the log of a flight."""
+    options = argparse.ArgumentParser(add_help=False)
+    options.add_argument(
         "--log", type=Path, metavar="LOG", help="telemetry log, where it does not lie beside FLIGHT"
     )
-    timing.add_argument(
+    options.add_argument(
         "--offset", type=shift, metavar="S",
         help="seconds added to the log's times, instead of finding them by rotation",
     )  # fmt: skip
+    return options
 
-    how = argparse.ArgumentParser(add_help=False, parents=[configuration(), timing, json_option()])
-    how.add_argument(
+
+def _how() -> argparse.ArgumentParser:
+    """Options of a replay."""
+    parents = [configuration(), _timing(), json_option()]
+    options = argparse.ArgumentParser(add_help=False, parents=parents)
+    options.add_argument(
         "--start", type=seconds, metavar="S", help="leave out what comes before this second"
     )
-    how.add_argument(
+    options.add_argument(
         "--stop", type=seconds, metavar="S", help="leave out what comes from this second on"
     )
-    how.add_argument(
+    options.add_argument(
         "--viewer", type=viewer, default="none", metavar="WHERE",
         help="show it live: none, web, native, or the rerun+http://… of a running viewer",
     )  # fmt: skip
-    how.add_argument(
+    options.add_argument(
         "--paced", action="store_true",
         help="in the flight's own time, dropping what a live run would drop",
     )  # fmt: skip
-    how.add_argument(
+    options.add_argument(
         "--map", type=Path, metavar="MAP",
         help="locate it in this site map of an earlier flight; over [map] use",
     )  # fmt: skip
-    how.add_argument(
+    options.add_argument(
         "--as-flown", action="store_true",
         help="of a recording: do again what was decided in flight, and compare what was sent",
     )  # fmt: skip
+    return options
 
-    replay = commands.add_parser(
-        "replay", parents=[how], help="turn a logged flight into a metric map",
+
+def _add_replay(commands: Any) -> None:
+    replay = command(
+        commands, "replay", _replay, parents=[_how()],
+        help="turn a logged flight into a metric map",
         description="Track the camera of a logged flight, reconstruct what it saw, report on it.",
     )  # fmt: skip
     replay.add_argument(
@@ -205,8 +211,10 @@ def add_parsers(commands: Any) -> None:
         "--out", type=Path, required=True, metavar="DIR", help="folder for the results"
     )
 
-    demo = commands.add_parser(
-        "demo", parents=[how], help="replay the sample flight: a first look",
+
+def _add_demo(commands: Any) -> None:
+    demo = command(
+        commands, "demo", _demo, parents=[_how()], help="replay the sample flight: a first look",
         description="Replay the sample flight that comes with the program, or another. It needs an "
         "OpenCL device, as every dense map does, and takes a minute or two.",
     )  # fmt: skip
@@ -216,8 +224,10 @@ def add_parsers(commands: Any) -> None:
         help="folder for the results (default: %(default)s)",
     )  # fmt: skip
 
-    imported = commands.add_parser(
-        "import", parents=[configuration(), timing],
+
+def _add_import(commands: Any) -> None:
+    imported = command(
+        commands, "import", _import, parents=[configuration(), _timing()],
         help="write any flight as a flight folder or a recording",
         description="Read a flight of any format and write it, all on one clock: as a folder with "
         "pictures, times, calibration and telemetry, or as FILE.mcap, a recording.",
@@ -227,8 +237,11 @@ def add_parsers(commands: Any) -> None:
         "--out", type=Path, required=True, metavar="OUT", help="a new folder, or FILE.mcap"
     )
 
-    export = commands.add_parser(
-        "export", parents=[configuration()], help="write a replay's results in other formats",
+
+def _add_export(commands: Any) -> None:
+    export = command(
+        commands, "export", _export, parents=[configuration()],
+        help="write a replay's results in other formats",
         description="Write clouds, rasters and paths for other programs, from the folder of a "
         "finished replay, with a statement of accuracy beside each.",
     )  # fmt: skip
@@ -244,8 +257,11 @@ def add_parsers(commands: Any) -> None:
     )  # fmt: skip
     export.add_argument("--out", type=Path, metavar="DIR", help="folder for them (default: RUN)")
 
-    film = commands.add_parser(
-        "film", parents=[configuration()], help="make a film of a flight, to be shown",
+
+def _add_film(commands: Any) -> None:
+    film = command(
+        commands, "film", _film, parents=[configuration()],
+        help="make a film of a flight, to be shown",
         description="Make a film of path and cloud as they grow, beside the picture.",
     )  # fmt: skip
     film.add_argument("run", type=Path, metavar="RUN", help="what --out of the replay was")

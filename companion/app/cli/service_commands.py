@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from companion.app.cli.options import Command
+from companion.app.cli.options import command
 from companion.app.stopping import StopSignals
 
 
@@ -31,9 +31,6 @@ def _notify(text: str) -> None:
     print(text, flush=True)
 
 
-COMMANDS: dict[str, Command] = {"install": _install, "uninstall": _uninstall}
-
-
 def add_parsers(commands: Any) -> None:
     """Add them to the subparsers of the program."""
     either = argparse.ArgumentParser(add_help=False)
@@ -43,8 +40,9 @@ def add_parsers(commands: Any) -> None:
     either.add_argument(
         "--dry-run", action="store_true", help="only say what would be done, step by step"
     )
-    install = commands.add_parser(
-        "install", parents=[either], help="have it start with the computer, by systemd",
+    install = command(
+        commands, "install", _install, parents=[either],
+        help="have it start with the computer, by systemd",
         description="Set up user, environment, configuration, unit and names of devices. What is "
         "there already is left as it is, so that it can be run again; if a step fails, those "
         "before it are undone.",
@@ -59,9 +57,10 @@ def add_parsers(commands: Any) -> None:
         "service cannot read that)",
     )  # fmt: skip
     install.add_argument("--now", action="store_true", help="start it, too")
-    uninstall = commands.add_parser(
-        "uninstall", parents=[either], help="take the service away; flights and configuration stay"
-    )
+    uninstall = command(
+        commands, "uninstall", _uninstall, parents=[either],
+        help="take the service away; flights and configuration stay",
+    )  # fmt: skip
     uninstall.add_argument(
         "--purge", action="store_true", help="take flights, configuration and user away, too"
     )

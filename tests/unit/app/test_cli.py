@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from companion import __version__
-from companion.app.cli import COMMANDS, READER_GONE, main
+from companion.app.cli import READER_GONE, hardware, main
 from companion.app.cli.options import held_folder
 from companion.config import Config
 from companion.config_file import load_config
@@ -165,7 +165,7 @@ def test_a_file_that_the_disk_does_not_take_is_named(
     def full(*_: object) -> int:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "out/cloud.ply")
 
-    monkeypatch.setitem(COMMANDS, "devices", full)
+    monkeypatch.setattr(hardware, "_devices", full)
     assert main(["devices"]) == 1
     why = "out/cloud.ply cannot be written: No space left on device"
     assert capsys.readouterr().err == f"companion: error: {why}\n"
