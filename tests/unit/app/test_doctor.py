@@ -206,17 +206,14 @@ def test_beside_a_daemon_it_goes_through_its_router(config: Config, tmp_path: Pa
     assert "the daemon hears ArduPilot, system 1, IMU 99 of 100 Hz\n" in text
 
 
-def test_link_held_by_a_daemon_without_a_router(config: Config, tmp_path: Path) -> None:
-    async def run() -> None:
-        daemon = StatusSocket(tmp_path / "status.sock", dict, lambda text: None)
-        await daemon.start()
-        try:
-            with pytest.raises(SourceError, match=r'router.clients = \["tcpin::5760"\]'):
-                await asyncio.to_thread(examine, config, "serial:/dev/ttyACM0:115200")
-        finally:
-            await daemon.stop()
-
-    asyncio.run(run())
+async def test_link_held_by_a_daemon_without_a_router(config: Config, tmp_path: Path) -> None:
+    daemon = StatusSocket(tmp_path / "status.sock", dict, lambda text: None)
+    await daemon.start()
+    try:
+        with pytest.raises(SourceError, match=r'router.clients = \["tcpin::5760"\]'):
+            await asyncio.to_thread(examine, config, "serial:/dev/ttyACM0:115200")
+    finally:
+        await daemon.stop()
 
 
 def test_no_autopilot(config: Config, tmp_path: Path) -> None:

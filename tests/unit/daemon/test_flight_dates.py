@@ -243,35 +243,30 @@ def test_a_damaged_date_is_none(tmp_path: Path, data: bytes) -> None:
     assert read_date(tmp_path) is None
 
 
-def test_the_autopilot_is_believed_when_it_says_so_again_and_again() -> None:
-    async def test() -> None:
-        port, clock = MemoryPort(), FlightClock(0)
-        link = AutopilotLink(LinkConfig(), port, clock, lambda _: None, lambda _: None)
-        date = AutopilotDate(link)
-        running = asyncio.ensure_future(link.run())
-        await asyncio.sleep(0)
-        await asyncio.sleep(0)
-        port.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), 0)
+async def test_the_autopilot_is_believed_when_it_says_so_again_and_again() -> None:
+    port, clock = MemoryPort(), FlightClock(0)
+    link = AutopilotLink(LinkConfig(), port, clock, lambda _: None, lambda _: None)
+    date = AutopilotDate(link)
+    running = asyncio.ensure_future(link.run())
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    port.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), 0)
 
-        def hear(unix_s: float, t_s: float) -> None:
-            boot_ms = round(t_s * 1e3) + 5000
-            port.hear(
-                mavlink.MAVLink_system_time_message(round(unix_s * 1e6), boot_ms), round(t_s * S)
-            )
+    def hear(unix_s: float, t_s: float) -> None:
+        boot_ms = round(t_s * 1e3) + 5000
+        port.hear(mavlink.MAVLink_system_time_message(round(unix_s * 1e6), boot_ms), round(t_s * S))
 
-        for n in range(N_ALIKE):
-            hear(0.0, float(n))
-        assert date.ahead_ns is None
-        for n in range(N_ALIKE):  # each of another year
-            hear(PRESENT_S + 1e7 * n, 10.0 + n)
-        assert date.ahead_ns is None
-        for n in range(N_ALIKE):
-            hear(PRESENT_S + n, 20.0 + n)
-        assert date.ahead_ns == pytest.approx((PRESENT_S - 20.0) * S, abs=S)
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
-
-    asyncio.run(test())
+    for n in range(N_ALIKE):
+        hear(0.0, float(n))
+    assert date.ahead_ns is None
+    for n in range(N_ALIKE):  # each of another year
+        hear(PRESENT_S + 1e7 * n, 10.0 + n)
+    assert date.ahead_ns is None
+    for n in range(N_ALIKE):
+        hear(PRESENT_S + n, 20.0 + n)
+    assert date.ahead_ns == pytest.approx((PRESENT_S - 20.0) * S, abs=S)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
 
 
 def test_the_kernel_says_whether_its_clock_is_kept_in_step() -> None:

@@ -248,14 +248,11 @@ def test_the_heartbeat_says_how_it_is(
     assert component_state(health) == state
 
 
-def test_it_runs_until_it_is_cancelled() -> None:
-    async def go() -> None:
-        control, _, _ = control_of(Config())
-        task = asyncio.ensure_future(control.run())
-        await asyncio.sleep(0.2)
-        assert not task.done()
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
-
-    asyncio.run(go())
+async def test_it_runs_until_it_is_cancelled() -> None:
+    control, _, _ = control_of(Config())
+    task = asyncio.ensure_future(control.run())
+    await asyncio.sleep(0.2)
+    assert not task.done()
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task

@@ -56,19 +56,15 @@ def test_a_service_manager_that_is_not_told_is_named_once() -> None:
     assert said == [(f"warning: {service.problem}", WARNING)] and "vsock" in service.problem
 
 
-def test_a_disk_that_hangs_holds_one_thread() -> None:
+async def test_a_disk_that_hangs_holds_one_thread() -> None:
     dates = HangingDates()
-
-    async def scene() -> None:
-        checks = checks_with(dates=dates)
-        for _ in range(5):
-            checks._step_dates()
-        dates.goes_on.set()
-        assert checks._dating is not None
-        await checks._dating
-        assert dates.n_begun == 1
+    checks = checks_with(dates=dates)
+    for _ in range(5):
         checks._step_dates()
-        await checks._dating
-        assert dates.n_begun == 2
-
-    asyncio.run(scene())
+    dates.goes_on.set()
+    assert checks._dating is not None
+    await checks._dating
+    assert dates.n_begun == 1
+    checks._step_dates()
+    await checks._dating
+    assert dates.n_begun == 2

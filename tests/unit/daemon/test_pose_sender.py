@@ -157,23 +157,20 @@ def flown(fly: Callable[[Path], Coroutine[Any, Any, None]]) -> Callable[[Path], 
 
 
 @pytest.mark.parametrize("mode", ["odometry", "vision_position"])
-def test_the_first_counter_is_0_and_each_start_in_the_air_one_more(
+async def test_the_first_counter_is_0_and_each_start_in_the_air_one_more(
     tmp_path: Path, mode: str
 ) -> None:
-    async def fly() -> None:
-        vehicle = Vehicle(tmp_path / "kept.json", mode)
-        for start in range(3):
-            await vehicle.begin()
-            poses = vehicle.run(4)
-            assert {pose.reset_counter for pose in poses} == {start}
-            if mode == "vision_position":
-                speeds = vehicle.port.of("VISION_SPEED_ESTIMATE")
-                assert {each.reset_counter for each in speeds} == {start}
-        vehicle.sender.restart()
-        assert {pose.reset_counter for pose in vehicle.run(3)} == {3}
-        assert {pose.reset_counter for pose in vehicle.run(3, resets=1)[5:]} == {4}
-
-    asyncio.run(fly())
+    vehicle = Vehicle(tmp_path / "kept.json", mode)
+    for start in range(3):
+        await vehicle.begin()
+        poses = vehicle.run(4)
+        assert {pose.reset_counter for pose in poses} == {start}
+        if mode == "vision_position":
+            speeds = vehicle.port.of("VISION_SPEED_ESTIMATE")
+            assert {each.reset_counter for each in speeds} == {start}
+    vehicle.sender.restart()
+    assert {pose.reset_counter for pose in vehicle.run(3)} == {3}
+    assert {pose.reset_counter for pose in vehicle.run(3, resets=1)[5:]} == {4}
 
 
 @flown
@@ -255,16 +252,13 @@ async def test_nothing_is_sent_where_the_attitude_is_not_believed(tmp_path: Path
 
 
 @pytest.mark.parametrize(("armed", "landed_state"), [(False, None), (True, 1)])
-def test_on_the_ground_poses_begin_at_0(
+async def test_on_the_ground_poses_begin_at_0(
     tmp_path: Path, armed: bool, landed_state: int | None
 ) -> None:
-    async def fly() -> None:
-        vehicle = Vehicle(tmp_path / "kept.json")
-        vehicle.down_m, vehicle.armed, vehicle.landed_state = None, armed, landed_state
-        await vehicle.begin()
-        assert {pose.z for pose in vehicle.run(4)} == {0.0}
-
-    asyncio.run(fly())
+    vehicle = Vehicle(tmp_path / "kept.json")
+    vehicle.down_m, vehicle.armed, vehicle.landed_state = None, armed, landed_state
+    await vehicle.begin()
+    assert {pose.z for pose in vehicle.run(4)} == {0.0}
 
 
 @flown
@@ -313,20 +307,16 @@ async def test_a_disk_that_cannot_be_written_is_reported_once(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"boot": 3}', bytes(range(256))])
-def test_a_damaged_file_is_not_taken_for_none(tmp_path: Path, content: bytes) -> None:
+async def test_a_damaged_file_is_not_taken_for_none(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "kept.json"
     path.write_bytes(content)
-
-    async def fly() -> None:
-        vehicle = Vehicle(path)
-        await vehicle.begin()
-        poses = vehicle.run(4)
-        assert poses and 0 not in {pose.reset_counter for pose in poses}
-        assert len(vehicle.not_kept) == 1
-        await vehicle.begin()
-        assert vehicle.run(4)[0].reset_counter == poses[0].reset_counter + 1, "it was put right"
-
-    asyncio.run(fly())
+    vehicle = Vehicle(path)
+    await vehicle.begin()
+    poses = vehicle.run(4)
+    assert poses and 0 not in {pose.reset_counter for pose in poses}
+    assert len(vehicle.not_kept) == 1
+    await vehicle.begin()
+    assert vehicle.run(4)[0].reset_counter == poses[0].reset_counter + 1, "it was put right"
 
 
 @flown

@@ -7,7 +7,7 @@ import contextlib
 import re
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -173,10 +173,6 @@ def asked_clock(port: MemoryPort) -> list[Any]:
     return [message for message in port.of("TIMESYNC") if message.tc1 == 0]
 
 
-def run(test: Coroutine[Any, Any, None]) -> None:
-    asyncio.run(test)
-
-
 def intervals(autopilot: FakeAutopilot) -> list[int]:
     return [int(each.message.param1) for each in autopilot.commands(SET_INTERVAL)]
 
@@ -185,56 +181,50 @@ def intervals(autopilot: FakeAutopilot) -> list[int]:
 
 
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_finds_the_autopilot_and_stamps_what_it_measures(firmware: str) -> None:
-    async def test() -> None:
-        with FakeAutopilot(
-            firmware, flight=circle(), system=7, drift_ppm=-12_000, jitter_ms=1
-        ) as autopilot:
-            autopilot.fly()
-            async with linked(autopilot, imu_hz=100) as heard:
-                link = heard.link
-                wanted = {"attitude", "imu", "local position", "global position", "GPS", "height"}
-                await heard.until(lambda: wanted <= heard.kinds().keys())
-                await asyncio.sleep(1.2)
-                assert link.vehicle is not None and link.alive
-                assert (link.vehicle.system_id, link.vehicle.firmware) == (7, firmware)
-                assert 25 < link.rates_hz["ATTITUDE_QUATERNION"] < 60
-                assert 50 < link.rates_hz["HIGHRES_IMU"] < 120
-                assert link.health.state == "running" and link.health.n_dropped < 20
-                # every message is asked for once, and the right ones are
-                assert max(Counter(intervals(autopilot)).values()) == 1
-                assert {31, 105, 32, 33, 24, 29, 132, 2, 245} == set(intervals(autopilot))
-                # the attitude of a circle tells the time at which it was measured
-                errors = []
-                for sample in heard.samples[-240:]:
-                    if isinstance(sample, AttitudeSample):
-                        at_ns = sample.t_ns - heard.clock.epoch_ns - autopilot._fly_ns  # type: ignore[operator]
-                        measured = autopilot.flight.message("ATTITUDE", at_ns * 1e-9)
-                        assert measured is not None
-                        w, _, _, z = sample.ned_from_body
-                        turned = 2 * np.arctan2(z, w) - measured[0].yaw
-                        errors.append(abs(np.degrees(np.arctan2(np.sin(turned), np.cos(turned)))))
-                # 18 degrees a second: 3 ms, and single ones worse on a busy machine
-                assert len(errors) > 30 and np.median(errors) < 0.054 and max(errors) < 0.5
-                got = autopilot.of("HEARTBEAT")[-1]
-                assert (got.system, got.component) == (7, 197)
-                assert (got.message.type, got.message.autopilot) == (18, 8)
-                assert got.message.base_mode == 0
-
-    run(test())
+async def test_finds_the_autopilot_and_stamps_what_it_measures(firmware: str) -> None:
+    with FakeAutopilot(
+        firmware, flight=circle(), system=7, drift_ppm=-12_000, jitter_ms=1
+    ) as autopilot:
+        autopilot.fly()
+        async with linked(autopilot, imu_hz=100) as heard:
+            link = heard.link
+            wanted = {"attitude", "imu", "local position", "global position", "GPS", "height"}
+            await heard.until(lambda: wanted <= heard.kinds().keys())
+            await asyncio.sleep(1.2)
+            assert link.vehicle is not None and link.alive
+            assert (link.vehicle.system_id, link.vehicle.firmware) == (7, firmware)
+            assert 25 < link.rates_hz["ATTITUDE_QUATERNION"] < 60
+            assert 50 < link.rates_hz["HIGHRES_IMU"] < 120
+            assert link.health.state == "running" and link.health.n_dropped < 20
+            # every message is asked for once, and the right ones are
+            assert max(Counter(intervals(autopilot)).values()) == 1
+            assert {31, 105, 32, 33, 24, 29, 132, 2, 245} == set(intervals(autopilot))
+            # the attitude of a circle tells the time at which it was measured
+            errors = []
+            for sample in heard.samples[-240:]:
+                if isinstance(sample, AttitudeSample):
+                    at_ns = sample.t_ns - heard.clock.epoch_ns - autopilot._fly_ns  # type: ignore[operator]
+                    measured = autopilot.flight.message("ATTITUDE", at_ns * 1e-9)
+                    assert measured is not None
+                    w, _, _, z = sample.ned_from_body
+                    turned = 2 * np.arctan2(z, w) - measured[0].yaw
+                    errors.append(abs(np.degrees(np.arctan2(np.sin(turned), np.cos(turned)))))
+            # 18 degrees a second: 3 ms, and single ones worse on a busy machine
+            assert len(errors) > 30 and np.median(errors) < 0.054 and max(errors) < 0.5
+            got = autopilot.of("HEARTBEAT")[-1]
+            assert (got.system, got.component) == (7, 197)
+            assert (got.message.type, got.message.autopilot) == (18, 8)
+            assert got.message.base_mode == 0
 
 
-def test_a_serial_line(tmp_path: Path) -> None:
-    async def test() -> None:
-        with FakeAutopilot("px4", f"pty:{tmp_path / 'tty'}:921600", circle()) as autopilot:
-            async with linked(autopilot) as heard:
-                autopilot.unplug()
-                await heard.until(lambda: not heard.link.port.connected)
-                autopilot.plug()
-                heard.samples.clear()
-                await heard.soon(lambda: heard.kinds()["attitude"], 2.0)
-
-    run(test())
+async def test_a_serial_line(tmp_path: Path) -> None:
+    with FakeAutopilot("px4", f"pty:{tmp_path / 'tty'}:921600", circle()) as autopilot:
+        async with linked(autopilot) as heard:
+            autopilot.unplug()
+            await heard.until(lambda: not heard.link.port.connected)
+            autopilot.plug()
+            heard.samples.clear()
+            await heard.soon(lambda: heard.kinds()["attitude"], 2.0)
 
 
 def test_a_recorded_flight_gives_the_samples_that_its_log_gives() -> None:
@@ -298,189 +288,157 @@ def _same(replayed: Telemetry, live: Telemetry, origin_apart_m: Array) -> bool:
 
 
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_a_reboot_is_named_and_everything_taken_up_again(firmware: str) -> None:
-    async def test() -> None:
-        with FakeAutopilot(firmware, flight=circle()) as autopilot:
-            async with linked(autopilot) as heard:
-                await asyncio.sleep(0.3)
-                autopilot.clear()
-                autopilot.reboot(silent_s=0.3)
-                await asyncio.sleep(0.3)
-                heard.samples.clear()
-                # of a reboot that is over everything is back within two seconds
-                await heard.soon(lambda: heard.kinds()["attitude"] > 10, 2.0)
-                await heard.soon(lambda: set(intervals(autopilot)) >= {31, 32, 33, 29}, 1.0)
-                assert heard.link.clock_filter.n_reboots == 1 and heard.link.health.n_dropped < 40
-                assert heard.named().count("autopilot rebooted") == 1
-                assert "telemetry stamped wildly" not in heard.named()
-                now_ns = time.monotonic_ns()
-                said_ns = heard.link.clock_filter.host_ns(autopilot.boot_ns(now_ns))
-                assert said_ns is not None
-                assert abs(said_ns - heard.clock.from_monotonic_ns(now_ns)) < 15_000_000
-
-    run(test())
+async def test_a_reboot_is_named_and_everything_taken_up_again(firmware: str) -> None:
+    with FakeAutopilot(firmware, flight=circle()) as autopilot:
+        async with linked(autopilot) as heard:
+            await asyncio.sleep(0.3)
+            autopilot.clear()
+            autopilot.reboot(silent_s=0.3)
+            await asyncio.sleep(0.3)
+            heard.samples.clear()
+            # of a reboot that is over everything is back within two seconds
+            await heard.soon(lambda: heard.kinds()["attitude"] > 10, 2.0)
+            await heard.soon(lambda: set(intervals(autopilot)) >= {31, 32, 33, 29}, 1.0)
+            assert heard.link.clock_filter.n_reboots == 1 and heard.link.health.n_dropped < 40
+            assert heard.named().count("autopilot rebooted") == 1
+            assert "telemetry stamped wildly" not in heard.named()
+            now_ns = time.monotonic_ns()
+            said_ns = heard.link.clock_filter.host_ns(autopilot.boot_ns(now_ns))
+            assert said_ns is not None
+            assert abs(said_ns - heard.clock.from_monotonic_ns(now_ns)) < 15_000_000
 
 
-def test_silence_is_named_and_its_end() -> None:
-    async def test() -> None:
-        with FakeAutopilot("px4", flight=circle()) as autopilot:
-            async with linked(autopilot, silent_after_s=0.3) as heard:
-                autopilot.silent = True
-                await heard.soon(lambda: not heard.link.alive, 1.0)
-                assert heard.link.health.state == "silent"
-                assert "autopilot silent" in heard.named()
-                heard.samples.clear()
-                autopilot.silent = False
-                await heard.soon(lambda: heard.link.alive and heard.samples, 1.0)
-                assert "autopilot heard again" in heard.named()
-                assert heard.link.clock_filter.n_reboots == 0
-
-    run(test())
+async def test_silence_is_named_and_its_end() -> None:
+    with FakeAutopilot("px4", flight=circle()) as autopilot:
+        async with linked(autopilot, silent_after_s=0.3) as heard:
+            autopilot.silent = True
+            await heard.soon(lambda: not heard.link.alive, 1.0)
+            assert heard.link.health.state == "silent"
+            assert "autopilot silent" in heard.named()
+            heard.samples.clear()
+            autopilot.silent = False
+            await heard.soon(lambda: heard.link.alive and heard.samples, 1.0)
+            assert "autopilot heard again" in heard.named()
+            assert heard.link.clock_filter.n_reboots == 0
 
 
-def test_the_autopilot_can_tell_our_clock() -> None:
+async def test_the_autopilot_can_tell_our_clock() -> None:
     """PX4 brings the stamps of an ODOMETRY onto its own clock by what we answer it."""
-
-    async def test() -> None:
-        with FakeAutopilot("px4", flight=hover(), jitter_ms=0.5, timesync_hz=20) as autopilot:
-            async with linked(autopilot) as heard:
-                await heard.until(lambda: len(autopilot.timesync) > 10)
-                said_ns = autopilot.peer_minus_boot_ns()
-                now_ns = time.monotonic_ns()
-                true_ns = heard.clock.from_monotonic_ns(now_ns) - autopilot.boot_ns(now_ns)
-                assert said_ns is not None and abs(said_ns - true_ns) < 15_000_000
-
-    run(test())
+    with FakeAutopilot("px4", flight=hover(), jitter_ms=0.5, timesync_hz=20) as autopilot:
+        async with linked(autopilot) as heard:
+            await heard.until(lambda: len(autopilot.timesync) > 10)
+            said_ns = autopilot.peer_minus_boot_ns()
+            now_ns = time.monotonic_ns()
+            true_ns = heard.clock.from_monotonic_ns(now_ns) - autopilot.boot_ns(now_ns)
+            assert said_ns is not None and abs(said_ns - true_ns) < 15_000_000
 
 
-def test_messages_that_a_firmware_lacks_are_replaced_or_named() -> None:
+async def test_messages_that_a_firmware_lacks_are_replaced_or_named() -> None:
     lacks = ("ATTITUDE_QUATERNION", "HIGHRES_IMU", "SCALED_IMU", "DISTANCE_SENSOR")
-
-    async def test() -> None:
-        with FakeAutopilot("ardupilot", flight=circle(), lacks=lacks) as autopilot:
-            async with linked(autopilot, imu_hz=50) as heard:
-                await heard.until(lambda: heard.kinds()["imu"] > 10)
-                await asyncio.sleep(0.3)
-                assert heard.link.rates_hz.keys() >= {"ATTITUDE", "RAW_IMU"}
-                details = [each.detail for each in heard.warned]
-                assert set(lacks) <= set(details)
-                assert max(Counter(intervals(autopilot)).values()) == 1
-
-    run(test())
+    with FakeAutopilot("ardupilot", flight=circle(), lacks=lacks) as autopilot:
+        async with linked(autopilot, imu_hz=50) as heard:
+            await heard.until(lambda: heard.kinds()["imu"] > 10)
+            await asyncio.sleep(0.3)
+            assert heard.link.rates_hz.keys() >= {"ATTITUDE", "RAW_IMU"}
+            details = [each.detail for each in heard.warned]
+            assert set(lacks) <= set(details)
+            assert max(Counter(intervals(autopilot)).values()) == 1
 
 
-def test_a_rate_that_falls_short_is_asked_for_again() -> None:
-    async def test() -> None:
-        with FakeAutopilot("ardupilot", flight=circle()) as autopilot:
-            async with linked(autopilot) as heard:
-                await asyncio.sleep(0.2)
-                autopilot.rates_hz["ATTITUDE_QUATERNION"] = 4  # another program asked for less
-                autopilot.clear()
-                await heard.until(lambda: 31 in intervals(autopilot))
-                assert intervals(autopilot).count(31) == 1
-                assert autopilot.rates_hz["ATTITUDE_QUATERNION"] == 50
-
-    run(test())
+async def test_a_rate_that_falls_short_is_asked_for_again() -> None:
+    with FakeAutopilot("ardupilot", flight=circle()) as autopilot:
+        async with linked(autopilot) as heard:
+            await asyncio.sleep(0.2)
+            autopilot.rates_hz["ATTITUDE_QUATERNION"] = 4  # another program asked for less
+            autopilot.clear()
+            await heard.until(lambda: 31 in intervals(autopilot))
+            assert intervals(autopilot).count(31) == 1
+            assert autopilot.rates_hz["ATTITUDE_QUATERNION"] == 50
 
 
 @pytest.mark.parametrize("backend", ["pymavlink", "mavsdk"])
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_the_imu_is_asked_for_as_the_link_carries_it(
+async def test_the_imu_is_asked_for_as_the_link_carries_it(
     short_windows: None, firmware: str, backend: str
 ) -> None:
-    async def test() -> None:
-        with FakeAutopilot(firmware, "udpin:127.0.0.1:0", circle()) as autopilot:
-            async with linked(autopilot, backend=backend) as heard:
-                assert not imu_intervals_us(autopilot)  # before it is known how the others come
-                await heard.until(lambda: heard.kinds()["imu"] > 150)
-                assert imu_intervals_us(autopilot) == [10_000]
-                assert 80 < heard.link.rates_hz["HIGHRES_IMU"] < 120
-                assert re.search(r", IMU \d+ of 100 Hz$", heard.link.health.detail)
-                autopilot.clear()
-                autopilot.reboot(silent_s=0.3)
-                heard.samples.clear()
-                await heard.until(lambda: heard.kinds()["imu"] > 50)
-                assert set(imu_intervals_us(autopilot)) == {10_000}
-                assert not of_imu(heard)
-
-    run(test())
+    with FakeAutopilot(firmware, "udpin:127.0.0.1:0", circle()) as autopilot:
+        async with linked(autopilot, backend=backend) as heard:
+            assert not imu_intervals_us(autopilot)  # before it is known how the others come
+            await heard.until(lambda: heard.kinds()["imu"] > 150)
+            assert imu_intervals_us(autopilot) == [10_000]
+            assert 80 < heard.link.rates_hz["HIGHRES_IMU"] < 120
+            assert re.search(r", IMU \d+ of 100 Hz$", heard.link.health.detail)
+            autopilot.clear()
+            autopilot.reboot(silent_s=0.3)
+            heard.samples.clear()
+            await heard.until(lambda: heard.kinds()["imu"] > 50)
+            assert set(imu_intervals_us(autopilot)) == {10_000}
+            assert not of_imu(heard)
 
 
 @pytest.mark.parametrize("n_lacking", [2, 3])
-def test_messages_of_the_imu_that_a_firmware_lacks(short_windows: None, n_lacking: int) -> None:
+async def test_messages_of_the_imu_that_a_firmware_lacks(
+    short_windows: None, n_lacking: int
+) -> None:
     lacks = ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU")[:n_lacking]
-
-    async def test() -> None:
-        with FakeAutopilot("ardupilot", flight=circle(), lacks=lacks) as autopilot:
-            async with linked(autopilot) as heard:
-                if n_lacking == 2:
-                    await heard.until(lambda: heard.kinds()["imu"] > 10)
-                    assert "RAW_IMU" in heard.link.rates_hz and not of_imu(heard)
-                else:
-                    await heard.until(lambda: of_imu(heard))
-                    assert of_imu(heard) == ["it has no message for it"]
-                    await asyncio.sleep(1.5)
-                    assert heard.link.health.detail.endswith("no IMU: it has no message for it")
-                assert len(imu_intervals_us(autopilot)) == 3  # one of each
-                assert "autopilot does not send a message" not in heard.named()
-
-    run(test())
+    with FakeAutopilot("ardupilot", flight=circle(), lacks=lacks) as autopilot:
+        async with linked(autopilot) as heard:
+            if n_lacking == 2:
+                await heard.until(lambda: heard.kinds()["imu"] > 10)
+                assert "RAW_IMU" in heard.link.rates_hz and not of_imu(heard)
+            else:
+                await heard.until(lambda: of_imu(heard))
+                assert of_imu(heard) == ["it has no message for it"]
+                await asyncio.sleep(1.5)
+                assert heard.link.health.detail.endswith("no IMU: it has no message for it")
+            assert len(imu_intervals_us(autopilot)) == 3  # one of each
+            assert "autopilot does not send a message" not in heard.named()
 
 
 @pytest.mark.parametrize("backend", ["pymavlink", "mavsdk"])
-def test_a_slow_line_has_no_room_for_the_imu(
+async def test_a_slow_line_has_no_room_for_the_imu(
     short_windows: None, tmp_path: Path, backend: str
 ) -> None:
-    async def test() -> None:
-        with FakeAutopilot("ardupilot", f"pty:{tmp_path / 'tty'}:57600", circle()) as autopilot:
-            async with linked(autopilot, backend=backend) as heard:
-                await heard.until(lambda: of_imu(heard))
-                await asyncio.sleep(1.5)
-                assert not imu_intervals_us(autopilot) and not heard.kinds()["imu"]
-                (said,) = of_imu(heard)
-                assert said.startswith("57600 baud have no room for it; set SERIALn_BAUD")
-                assert heard.link.health.detail.endswith(f"no IMU: {said}")
-
-    run(test())
+    with FakeAutopilot("ardupilot", f"pty:{tmp_path / 'tty'}:57600", circle()) as autopilot:
+        async with linked(autopilot, backend=backend) as heard:
+            await heard.until(lambda: of_imu(heard))
+            await asyncio.sleep(1.5)
+            assert not imu_intervals_us(autopilot) and not heard.kinds()["imu"]
+            (said,) = of_imu(heard)
+            assert said.startswith("57600 baud have no room for it; set SERIALn_BAUD")
+            assert heard.link.health.detail.endswith(f"no IMU: {said}")
 
 
-def test_a_signed_link(tmp_path: Path) -> None:
+async def test_a_signed_link(tmp_path: Path) -> None:
     key = bytes(range(32))
     (tmp_path / "key").write_text(key.hex())
-
-    async def test() -> None:
-        with FakeAutopilot("px4", flight=circle(), signing_key=key) as autopilot:
-            async with linked(autopilot, signing_key_file=str(tmp_path / "key")) as heard:
-                assert heard.link.alive and autopilot.n_bad == 0
-
-    run(test())
+    with FakeAutopilot("px4", flight=circle(), signing_key=key) as autopilot:
+        async with linked(autopilot, signing_key_file=str(tmp_path / "key")) as heard:
+            assert heard.link.alive and autopilot.n_bad == 0
 
 
-def test_commands_on_a_wire_that_loses_a_third() -> None:
-    async def test() -> None:
-        with FakeAutopilot("px4", flight=circle()) as autopilot:
-            async with linked(autopilot) as heard:
-                autopilot.loss = 0.33
-                arm = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
-                result = await heard.link.commands.long(arm, 1, timeout_s=0.05, tries=40)
-                assert result == mavlink.MAV_RESULT_ACCEPTED and autopilot.armed
-                autopilot.loss = 0.0
-                await heard.until(lambda: ArmedSample in map(type, heard.samples))
-                await heard.until(lambda: heard.link.vehicle and heard.link.vehicle.armed)
-                home = await heard.link.request_message(mavlink.MAVLINK_MSG_ID_HOME_POSITION)
-                assert home is not None
-                assert home.latitude == round(HERE.latitude_deg * 1e7)
-                assert await heard.link.request_message(9999) is None
-                place = GeoOrigin(47.1234567, 8.7654321, 432.1)
-                assert await heard.link.commands.at(611, place) == mavlink.MAV_RESULT_ACCEPTED
-                assert autopilot.origin is not None
-                assert autopilot.origin.latitude_deg == pytest.approx(47.1234567, abs=1e-7)
-
-    run(test())
+async def test_commands_on_a_wire_that_loses_a_third() -> None:
+    with FakeAutopilot("px4", flight=circle()) as autopilot:
+        async with linked(autopilot) as heard:
+            autopilot.loss = 0.33
+            arm = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+            result = await heard.link.commands.long(arm, 1, timeout_s=0.05, tries=40)
+            assert result == mavlink.MAV_RESULT_ACCEPTED and autopilot.armed
+            autopilot.loss = 0.0
+            await heard.until(lambda: ArmedSample in map(type, heard.samples))
+            await heard.until(lambda: heard.link.vehicle and heard.link.vehicle.armed)
+            home = await heard.link.request_message(mavlink.MAVLINK_MSG_ID_HOME_POSITION)
+            assert home is not None
+            assert home.latitude == round(HERE.latitude_deg * 1e7)
+            assert await heard.link.request_message(9999) is None
+            place = GeoOrigin(47.1234567, 8.7654321, 432.1)
+            assert await heard.link.commands.at(611, place) == mavlink.MAV_RESULT_ACCEPTED
+            assert autopilot.origin is not None
+            assert autopilot.origin.latitude_deg == pytest.approx(47.1234567, abs=1e-7)
 
 
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_without_gps_positions_are_those_that_the_autopilot_was_given(firmware: str) -> None:
+async def test_without_gps_positions_are_those_that_the_autopilot_was_given(firmware: str) -> None:
     """The pretended autopilot's side of it: what follows from this is not the link's to decide."""
 
     def odometry(t_ns: int) -> Any:
@@ -490,284 +448,240 @@ def test_without_gps_positions_are_those_that_the_autopilot_was_given(firmware: 
             unknown, unknown, 0, 3, 90,
         )  # fmt: skip
 
-    async def test() -> None:
-        with FakeAutopilot(firmware, flight=circle(), gps=False) as autopilot:
-            async with linked(autopilot) as heard:
-                await heard.until(lambda: heard.kinds()["height"] > 5)
-                assert "GPS" not in heard.kinds()
-                for each in heard.samples:  # PX4 tells its height before it knows its place
-                    if isinstance(each, PositionSample):
-                        assert firmware == "px4" and not each.position_ned_m[:2].any()
-                heard.link.send(
-                    mavlink.MAVLink_set_gps_global_origin_message(1, 473977420, 85455940, 489000)
-                )
-                heard.link.send(odometry(heard.clock.now_ns()))
-                told = heard.kinds()["local position"]
-                await heard.until(lambda: heard.kinds()["local position"] > told + 2)
-                local = [each for each in heard.samples if kind_of(each) == "local position"]
-                assert isinstance(local[-1], PositionSample)
-                assert local[-1].position_ned_m == pytest.approx([3, -4, -5])
-                assert heard.link.origin is not None
-                assert heard.link.origin.latitude_deg == pytest.approx(47.397742)
-
-    run(test())
+    with FakeAutopilot(firmware, flight=circle(), gps=False) as autopilot:
+        async with linked(autopilot) as heard:
+            await heard.until(lambda: heard.kinds()["height"] > 5)
+            assert "GPS" not in heard.kinds()
+            for each in heard.samples:  # PX4 tells its height before it knows its place
+                if isinstance(each, PositionSample):
+                    assert firmware == "px4" and not each.position_ned_m[:2].any()
+            heard.link.send(
+                mavlink.MAVLink_set_gps_global_origin_message(1, 473977420, 85455940, 489000)
+            )
+            heard.link.send(odometry(heard.clock.now_ns()))
+            told = heard.kinds()["local position"]
+            await heard.until(lambda: heard.kinds()["local position"] > told + 2)
+            local = [each for each in heard.samples if kind_of(each) == "local position"]
+            assert isinstance(local[-1], PositionSample)
+            assert local[-1].position_ned_m == pytest.approx([3, -4, -5])
+            assert heard.link.origin is not None
+            assert heard.link.origin.latitude_deg == pytest.approx(47.397742)
 
 
-def test_texts_reach_the_autopilot_in_one_piece_each() -> None:
-    async def test() -> None:
-        with FakeAutopilot("px4", flight=circle()) as autopilot:
-            async with linked(autopilot) as heard:
-                heard.link.say(position_lost("tilt differs from the autopilot's"))
-                heard.link.say(CAMERA_RECOVERED())
-                await heard.until(lambda: len(autopilot.of("STATUSTEXT")) == 2)
-                assert autopilot.texts() == [
-                    "Companion: vision position lost: attitude mismatch",
-                    "Companion: camera recovered",
-                ]
-                assert [each.message.severity for each in autopilot.of("STATUSTEXT")] == [4, 6]
-
-    run(test())
+async def test_texts_reach_the_autopilot_in_one_piece_each() -> None:
+    with FakeAutopilot("px4", flight=circle()) as autopilot:
+        async with linked(autopilot) as heard:
+            heard.link.say(position_lost("tilt differs from the autopilot's"))
+            heard.link.say(CAMERA_RECOVERED())
+            await heard.until(lambda: len(autopilot.of("STATUSTEXT")) == 2)
+            assert autopilot.texts() == [
+                "Companion: vision position lost: attitude mismatch",
+                "Companion: camera recovered",
+            ]
+            assert [each.message.severity for each in autopilot.of("STATUSTEXT")] == [4, 6]
 
 
 # -- made-up messages ------------------------------------------------------------------------------
 
 
-def test_speaks_first_and_only_of_itself() -> None:
-    async def test() -> None:
-        port, clock = MemoryPort(), FlightClock()
-        async with running(LinkConfig(), port, clock) as heard:
-            await heard.until(lambda: port.sent)
-            await asyncio.sleep(0.25)
-            assert {message.get_type() for message in port.sent} == {"HEARTBEAT"}
-            assert port.identity == (1, 197)
-            assert heard.link.health.state == "opening"
-
-    run(test())
+async def test_speaks_first_and_only_of_itself() -> None:
+    port, clock = MemoryPort(), FlightClock()
+    async with running(LinkConfig(), port, clock) as heard:
+        await heard.until(lambda: port.sent)
+        await asyncio.sleep(0.25)
+        assert {message.get_type() for message in port.sent} == {"HEARTBEAT"}
+        assert port.identity == (1, 197)
+        assert heard.link.health.state == "opening"
 
 
-def test_another_vehicle_is_ignored_and_named_once() -> None:
-    async def test() -> None:
-        async with spoken() as (heard, port, talk):
-            for n in range(20):
-                talk.say(heartbeat(armed=True), 0.1 * n, system=2)
-                talk.say(attitude(5000 + 20 * n), 0.1 * n, system=2)
-                talk.say(heartbeat(autopilot=mavlink.MAV_AUTOPILOT_INVALID), 0.1 * n, 1, 197)
-                talk.say(attitude(5000 + 20 * n), 0.1 * n, component=191)
-                talk.say(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), 0.1 * n, 255, 190)
-            assert heard.named().count("another vehicle on the link") == 1
-            assert heard.kinds() == {"armed": 1}
-            assert heard.link.vehicle is not None and heard.link.vehicle.system_id == 1
-            assert port.identity == (1, 197) and heard.link.clock_filter.n_reboots == 0
-
-    run(test())
+async def test_another_vehicle_is_ignored_and_named_once() -> None:
+    async with spoken() as (heard, port, talk):
+        for n in range(20):
+            talk.say(heartbeat(armed=True), 0.1 * n, system=2)
+            talk.say(attitude(5000 + 20 * n), 0.1 * n, system=2)
+            talk.say(heartbeat(autopilot=mavlink.MAV_AUTOPILOT_INVALID), 0.1 * n, 1, 197)
+            talk.say(attitude(5000 + 20 * n), 0.1 * n, component=191)
+            talk.say(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), 0.1 * n, 255, 190)
+        assert heard.named().count("another vehicle on the link") == 1
+        assert heard.kinds() == {"armed": 1}
+        assert heard.link.vehicle is not None and heard.link.vehicle.system_id == 1
+        assert port.identity == (1, 197) and heard.link.clock_filter.n_reboots == 0
 
 
-def test_the_configured_vehicle_is_waited_for() -> None:
-    async def test() -> None:
-        port, clock = MemoryPort(), FlightClock()
-        async with running(LinkConfig(system_id=3), port, clock) as heard:
-            await heard.until(lambda: port.sent)
-            talk = Talk(port, clock.now_ns())
-            talk.say(heartbeat(), 0.0)
-            assert heard.link.vehicle is None and not heard.link.alive
-            assert heard.named() == ["another vehicle on the link"]
-            talk.say(heartbeat(), 0.1, system=3)
-            assert heard.link.vehicle is not None and heard.link.vehicle.system_id == 3
-            assert port.identity == (3, 197)
-
-    run(test())
+async def test_the_configured_vehicle_is_waited_for() -> None:
+    port, clock = MemoryPort(), FlightClock()
+    async with running(LinkConfig(system_id=3), port, clock) as heard:
+        await heard.until(lambda: port.sent)
+        talk = Talk(port, clock.now_ns())
+        talk.say(heartbeat(), 0.0)
+        assert heard.link.vehicle is None and not heard.link.alive
+        assert heard.named() == ["another vehicle on the link"]
+        talk.say(heartbeat(), 0.1, system=3)
+        assert heard.link.vehicle is not None and heard.link.vehicle.system_id == 3
+        assert port.identity == (3, 197)
 
 
-def test_answers_to_others_are_not_taken() -> None:
-    async def test() -> None:
-        port, clock = MemoryPort(), FlightClock()
-        async with running(LinkConfig(), port, clock) as heard:
-            await heard.until(lambda: port.sent)
-            talk = Talk(port, clock.now_ns())
-            talk.say(heartbeat(), 0.0)
-            await heard.until(lambda: asked_clock(port))
-            [question, *_] = asked_clock(port)
-            talk.say(mavlink.MAVLink_timesync_message(50 * SECOND, question.ts1 - 77), 0.01)
-            talk.answer(question.ts1, system=2)
-            assert heard.link.clock_filter.host_ns(100 * SECOND) is None
-            talk.answer(question.ts1)
-            talk.say(mavlink.MAVLink_timesync_message(50 * SECOND, question.ts1), 0.02)  # again
-            said_ns = heard.link.clock_filter.host_ns(100 * SECOND)
-            assert said_ns == pytest.approx(talk.begin_ns, abs=100_000)
-
-    run(test())
+async def test_answers_to_others_are_not_taken() -> None:
+    port, clock = MemoryPort(), FlightClock()
+    async with running(LinkConfig(), port, clock) as heard:
+        await heard.until(lambda: port.sent)
+        talk = Talk(port, clock.now_ns())
+        talk.say(heartbeat(), 0.0)
+        await heard.until(lambda: asked_clock(port))
+        [question, *_] = asked_clock(port)
+        talk.say(mavlink.MAVLink_timesync_message(50 * SECOND, question.ts1 - 77), 0.01)
+        talk.answer(question.ts1, system=2)
+        assert heard.link.clock_filter.host_ns(100 * SECOND) is None
+        talk.answer(question.ts1)
+        talk.say(mavlink.MAVLink_timesync_message(50 * SECOND, question.ts1), 0.02)  # again
+        said_ns = heard.link.clock_filter.host_ns(100 * SECOND)
+        assert said_ns == pytest.approx(talk.begin_ns, abs=100_000)
 
 
-def test_the_autopilots_questions_are_answered_with_the_flights_time() -> None:
-    async def test() -> None:
-        async with spoken() as (heard, port, _talk):
-            now_ns = heard.clock.now_ns()
+async def test_the_autopilots_questions_are_answered_with_the_flights_time() -> None:
+    async with spoken() as (heard, port, _talk):
+        now_ns = heard.clock.now_ns()
+        port.sent.clear()
+        port.hear(mavlink.MAVLink_timesync_message(0, 123_456_789_000), now_ns)
+        port.hear(mavlink.MAVLink_timesync_message(0, 42), now_ns, system=255, component=190)
+        [answer] = [message for message in port.of("TIMESYNC") if message.tc1]
+        assert answer.ts1 == 123_456_789_000
+        assert now_ns <= answer.tc1 <= heard.clock.now_ns()
+
+
+async def test_timesync_names_whom_it_is_for() -> None:
+    async with spoken() as (_heard, port, talk):
+        [question, *_] = asked_clock(port)
+        assert timesync_target(question) == (1, 1)
+
+        def answers(message: Any) -> list[Any]:
             port.sent.clear()
-            port.hear(mavlink.MAVLink_timesync_message(0, 123_456_789_000), now_ns)
-            port.hear(mavlink.MAVLink_timesync_message(0, 42), now_ns, system=255, component=190)
-            [answer] = [message for message in port.of("TIMESYNC") if message.tc1]
-            assert answer.ts1 == 123_456_789_000
-            assert now_ns <= answer.tc1 <= heard.clock.now_ns()
+            talk.say(message, 0.01)
+            return [each for each in port.of("TIMESYNC") if each.tc1]
 
-    run(test())
-
-
-def test_timesync_names_whom_it_is_for() -> None:
-    async def test() -> None:
-        async with spoken() as (_heard, port, talk):
-            [question, *_] = asked_clock(port)
-            assert timesync_target(question) == (1, 1)
-
-            def answers(message: Any) -> list[Any]:
-                port.sent.clear()
-                talk.say(message, 0.01)
-                return [each for each in port.of("TIMESYNC") if each.tc1]
-
-            assert not answers(TimesyncMessage(0, 7 * SECOND, (1, 191)))
-            [answer] = answers(TimesyncMessage(0, 8 * SECOND, (1, 197)))
-            assert timesync_target(answer) == (1, 1)
-            # one who does not know the extension reads it as ever
-            [read] = mavlink.MAVLink(None).parse_buffer(answer.get_msgbuf())
-            assert (read.tc1, read.ts1) == (answer.tc1, 8 * SECOND)
-            [to_all] = answers(mavlink.MAVLink_timesync_message(0, 9 * SECOND))
-            assert to_all.ts1 == 9 * SECOND
-
-    run(test())
+        assert not answers(TimesyncMessage(0, 7 * SECOND, (1, 191)))
+        [answer] = answers(TimesyncMessage(0, 8 * SECOND, (1, 197)))
+        assert timesync_target(answer) == (1, 1)
+        # one who does not know the extension reads it as ever
+        [read] = mavlink.MAVLink(None).parse_buffer(answer.get_msgbuf())
+        assert (read.tc1, read.ts1) == (answer.tc1, 8 * SECOND)
+        [to_all] = answers(mavlink.MAVLink_timesync_message(0, 9 * SECOND))
+        assert to_all.ts1 == 9 * SECOND
 
 
-def test_replayed_and_wild_stamps_are_dropped_counted_and_named() -> None:
-    async def test() -> None:
-        async with spoken() as (heard, _port, talk):
-            for n in range(100):
-                talk.attitude(0.02 * n)
-                if n > 10:
-                    talk.attitude(0.02 * (n - 5), late_s=0.1)  # 0.1 s ago, again
-                if n > 60:
-                    talk.attitude(0.02 * n - 1.2, late_s=1.2)  # so long ago that it is no jitter
-                    talk.attitude(0.02 * n + 3600, late_s=-3600)
-                    talk.attitude(0.02 * n + 0.5, late_s=-0.5)
-            assert heard.kinds()["attitude"] == 100
-            times = [each.t_ns for each in heard.samples if isinstance(each, AttitudeSample)]
-            assert times == sorted(times)
-            error_ns = np.array(times) - talk.begin_ns - 20_000_000 * np.arange(100)
-            assert np.abs(error_ns).max() < 5_000_000
-            dropped = heard.link.samples.n_dropped
-            assert dropped["telemetry out of order"] == 89
-            assert dropped["telemetry stamped wildly"] == 78
-            assert dropped["telemetry from the future"] == 39
-            assert heard.link.health.n_dropped == 89 + 78 + 39
-            for what in dropped:
-                assert heard.named().count(what) == 1
-            assert heard.link.clock_filter.n_reboots == 0
-
-    run(test())
+async def test_replayed_and_wild_stamps_are_dropped_counted_and_named() -> None:
+    async with spoken() as (heard, _port, talk):
+        for n in range(100):
+            talk.attitude(0.02 * n)
+            if n > 10:
+                talk.attitude(0.02 * (n - 5), late_s=0.1)  # 0.1 s ago, again
+            if n > 60:
+                talk.attitude(0.02 * n - 1.2, late_s=1.2)  # so long ago that it is no jitter
+                talk.attitude(0.02 * n + 3600, late_s=-3600)
+                talk.attitude(0.02 * n + 0.5, late_s=-0.5)
+        assert heard.kinds()["attitude"] == 100
+        times = [each.t_ns for each in heard.samples if isinstance(each, AttitudeSample)]
+        assert times == sorted(times)
+        error_ns = np.array(times) - talk.begin_ns - 20_000_000 * np.arange(100)
+        assert np.abs(error_ns).max() < 5_000_000
+        dropped = heard.link.samples.n_dropped
+        assert dropped["telemetry out of order"] == 89
+        assert dropped["telemetry stamped wildly"] == 78
+        assert dropped["telemetry from the future"] == 39
+        assert heard.link.health.n_dropped == 89 + 78 + 39
+        for what in dropped:
+            assert heard.named().count(what) == 1
+        assert heard.link.clock_filter.n_reboots == 0
 
 
-def test_late_telemetry_keeps_its_time_and_is_named() -> None:
-    async def test() -> None:
-        async with spoken() as (heard, _port, talk):
-            for n in range(50):
-                talk.attitude(0.02 * n)
-            for n in range(50, 100):
-                talk.attitude(0.02 * n, late_s=2.5)
-            times = [each.t_ns for each in heard.samples if isinstance(each, AttitudeSample)]
-            assert (times[-1] - talk.begin_ns) * 1e-9 == pytest.approx(1.98, abs=0.01)
-            assert heard.named().count("telemetry late") == 1
-
-    run(test())
+async def test_late_telemetry_keeps_its_time_and_is_named() -> None:
+    async with spoken() as (heard, _port, talk):
+        for n in range(50):
+            talk.attitude(0.02 * n)
+        for n in range(50, 100):
+            talk.attitude(0.02 * n, late_s=2.5)
+        times = [each.t_ns for each in heard.samples if isinstance(each, AttitudeSample)]
+        assert (times[-1] - talk.begin_ns) * 1e-9 == pytest.approx(1.98, abs=0.01)
+        assert heard.named().count("telemetry late") == 1
 
 
-def test_nonsense_is_dropped_and_nothing_breaks() -> None:
-    async def test() -> None:
-        async with spoken() as (heard, _port, talk):
-            nan, inf = float("nan"), float("inf")
-            talk.attitude(0.0)
-            talk.attitude(0.1, roll=nan)
-            talk.attitude(0.2, roll=inf)
-            stamps = iter(range(100_300, 200_000, 20))
-            for values in ([nan] * 6, [inf] * 6, [1e38] * 6):
-                message = mavlink.MAVLink_local_position_ned_message(next(stamps), *values)
-                talk.say(message, 0.5)
-            for q in ([0.0] * 4, [nan] * 4, [5.0] * 4):
-                talk.say(
-                    mavlink.MAVLink_attitude_quaternion_message(next(stamps), *q, 0, 0, 0, q), 0.5
-                )
-            big = 2**31 - 1
-            talk.say(
-                mavlink.MAVLink_global_position_int_message(
-                    next(stamps), big, -big, big, big, 0, 0, 0, 0
-                ),
-                0.5,
-            )
-            talk.say(mavlink.MAVLink_gps_global_origin_message(big, big, big, 0), 0.5)
-            talk.say(mavlink.MAVLink_scaled_pressure_message(next(stamps), nan, 0, 0), 0.5)
-            talk.say(mavlink.MAVLink_timesync_message(-5, -5), 0.5)
-            talk.say(mavlink.MAVLink_timesync_message(0, -(2**62)), 0.5)
-            talk.say(mavlink.MAVLink_timesync_message(0, 2**62), 0.5)
-            talk.say(mavlink.MAVLink_system_time_message(2**63, 2**32 - 1), 0.5)
-            talk.say(mavlink.MAVLink_command_ack_message(511, 0), 0.5)
-            talk.say(mavlink.MAVLink_statustext_message(2, b"\xff\xfe"), 0.5)
-            talk.attitude(1.0)
-            assert heard.kinds()["attitude"] == 2
-            assert not [each for each in heard.samples if isinstance(each, PositionSample)]
-            assert heard.link.origin is None
-            assert "telemetry that is not usable" in heard.named()
-
-    run(test())
+async def test_nonsense_is_dropped_and_nothing_breaks() -> None:
+    async with spoken() as (heard, _port, talk):
+        nan, inf = float("nan"), float("inf")
+        talk.attitude(0.0)
+        talk.attitude(0.1, roll=nan)
+        talk.attitude(0.2, roll=inf)
+        stamps = iter(range(100_300, 200_000, 20))
+        for values in ([nan] * 6, [inf] * 6, [1e38] * 6):
+            message = mavlink.MAVLink_local_position_ned_message(next(stamps), *values)
+            talk.say(message, 0.5)
+        for q in ([0.0] * 4, [nan] * 4, [5.0] * 4):
+            talk.say(mavlink.MAVLink_attitude_quaternion_message(next(stamps), *q, 0, 0, 0, q), 0.5)
+        big = 2**31 - 1
+        talk.say(
+            mavlink.MAVLink_global_position_int_message(
+                next(stamps), big, -big, big, big, 0, 0, 0, 0
+            ),
+            0.5,
+        )
+        talk.say(mavlink.MAVLink_gps_global_origin_message(big, big, big, 0), 0.5)
+        talk.say(mavlink.MAVLink_scaled_pressure_message(next(stamps), nan, 0, 0), 0.5)
+        talk.say(mavlink.MAVLink_timesync_message(-5, -5), 0.5)
+        talk.say(mavlink.MAVLink_timesync_message(0, -(2**62)), 0.5)
+        talk.say(mavlink.MAVLink_timesync_message(0, 2**62), 0.5)
+        talk.say(mavlink.MAVLink_system_time_message(2**63, 2**32 - 1), 0.5)
+        talk.say(mavlink.MAVLink_command_ack_message(511, 0), 0.5)
+        talk.say(mavlink.MAVLink_statustext_message(2, b"\xff\xfe"), 0.5)
+        talk.attitude(1.0)
+        assert heard.kinds()["attitude"] == 2
+        assert not [each for each in heard.samples if isinstance(each, PositionSample)]
+        assert heard.link.origin is None
+        assert "telemetry that is not usable" in heard.named()
 
 
-def test_arming_is_reported_on_change() -> None:
-    async def test() -> None:
-        async with spoken() as (heard, _port, talk):
-            for n, armed in enumerate([False, True, True, False]):
-                talk.say(heartbeat(armed), 1.0 + n)
-            told = [each.armed for each in heard.samples if isinstance(each, ArmedSample)]
-            assert told == [False, True, False]
-
-    run(test())
+async def test_arming_is_reported_on_change() -> None:
+    async with spoken() as (heard, _port, talk):
+        for n, armed in enumerate([False, True, True, False]):
+            talk.say(heartbeat(armed), 1.0 + n)
+        told = [each.armed for each in heard.samples if isinstance(each, ArmedSample)]
+        assert told == [False, True, False]
 
 
-def test_of_two_attitudes_the_more_frequent_is_taken() -> None:
+async def test_of_two_attitudes_the_more_frequent_is_taken() -> None:
     def quaternion(boot_ms: int) -> Any:
         return mavlink.MAVLink_attitude_quaternion_message(
             boot_ms, 1, 0, 0, 0, 0, 0, 0, [0.0, 0.0, 0.0, 0.0]
         )
 
-    async def test() -> None:
-        async with spoken() as (heard, _port, talk):
-            for n in range(200):  # 50 a second, and 10 of the other
-                talk.attitude(0.02 * n)
-                if n % 5 == 0:
-                    talk.say(quaternion(100_000 + 20 * n + 10), 0.02 * n + 0.012)
-            assert heard.kinds()["attitude"] == 200
-            for n in range(200, 500):  # as frequent: what is richer
-                talk.attitude(0.02 * n)
+    async with spoken() as (heard, _port, talk):
+        for n in range(200):  # 50 a second, and 10 of the other
+            talk.attitude(0.02 * n)
+            if n % 5 == 0:
                 talk.say(quaternion(100_000 + 20 * n + 10), 0.02 * n + 0.012)
-            last = [each for each in heard.samples if isinstance(each, AttitudeSample)][-100:]
-            assert all(each.ned_from_body[0] == 1 for each in last)
-            assert 490 < heard.kinds()["attitude"] < 510
+        assert heard.kinds()["attitude"] == 200
+        for n in range(200, 500):  # as frequent: what is richer
+            talk.attitude(0.02 * n)
+            talk.say(quaternion(100_000 + 20 * n + 10), 0.02 * n + 0.012)
+        last = [each for each in heard.samples if isinstance(each, AttitudeSample)][-100:]
+        assert all(each.ned_from_body[0] == 1 for each in last)
+        assert 490 < heard.kinds()["attitude"] < 510
 
-    run(test())
 
-
-def test_commands_are_repeated_and_answers_to_others_ignored() -> None:
-    async def test() -> None:
-        async with spoken() as (heard, port, talk):
-            asking = asyncio.create_task(heard.link.commands.long(400, 1, timeout_s=0.05, tries=3))
-            await asyncio.sleep(0.02)
-            talk.say(mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 255, 190), 0.1)
-            talk.say(mavlink.MAVLink_command_ack_message(401, 0), 0.1)
-            assert await asking == NO_ANSWER
-            assert [each.confirmation for each in port.of("COMMAND_LONG")][-3:] == [0, 1, 2]
-            asking = asyncio.create_task(heard.link.commands.long(400, 1, timeout_s=0.3, tries=1))
-            await asyncio.sleep(0)  # it has asked
-            talk.say(mavlink.MAVLink_command_ack_message(400, 5, 10, 0, 1, 197), 0.2)
-            await asyncio.sleep(0.6)  # longer than it would have been waited for
-            assert not asking.done()
-            talk.say(mavlink.MAVLink_command_ack_message(400, 4, 0, 0, 1, 197), 0.3)
-            assert await asking == mavlink.MAV_RESULT_FAILED
-
-    run(test())
+async def test_commands_are_repeated_and_answers_to_others_ignored() -> None:
+    async with spoken() as (heard, port, talk):
+        asking = asyncio.create_task(heard.link.commands.long(400, 1, timeout_s=0.05, tries=3))
+        await asyncio.sleep(0.02)
+        talk.say(mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 255, 190), 0.1)
+        talk.say(mavlink.MAVLink_command_ack_message(401, 0), 0.1)
+        assert await asking == NO_ANSWER
+        assert [each.confirmation for each in port.of("COMMAND_LONG")][-3:] == [0, 1, 2]
+        asking = asyncio.create_task(heard.link.commands.long(400, 1, timeout_s=0.3, tries=1))
+        await asyncio.sleep(0)  # it has asked
+        talk.say(mavlink.MAVLink_command_ack_message(400, 5, 10, 0, 1, 197), 0.2)
+        await asyncio.sleep(0.6)  # longer than it would have been waited for
+        assert not asking.done()
+        talk.say(mavlink.MAVLink_command_ack_message(400, 4, 0, 0, 1, 197), 0.3)
+        assert await asking == mavlink.MAV_RESULT_FAILED
 
 
 # -- parts -----------------------------------------------------------------------------------------

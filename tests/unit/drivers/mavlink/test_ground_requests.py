@@ -135,29 +135,26 @@ def test_nothing_that_is_sent_breaks_it() -> None:
     assert len(ours.port.sent) > ours.n_done  # others were told that theirs is not known
 
 
-def test_the_link_hands_on_what_others_than_the_autopilot_ask() -> None:
-    async def go() -> None:
-        port, clock = MemoryPort(), FlightClock()
-        link = AutopilotLink(LinkConfig(), port, clock, lambda _: None, lambda _: None)
-        table = One()
-        requests = GroundRequests(
-            port, clock, CommandServer({}), ParameterServer(table),
-            MissionServer(lambda: np.zeros((3, 3))), lambda _: None,
-        )  # fmt: skip
-        link.on_request = requests.take
-        tasks = [asyncio.ensure_future(each) for each in (link.run(), requests.run())]
-        await asyncio.sleep(0.05)
-        port.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), clock.now_ns())
-        message = mavlink.MAVLink_param_set_message(1, 197, b"ONE", 2.0, 9)
-        port.hear(message, clock.now_ns(), 255, 190)
-        await until(lambda: bool(port.of("PARAM_VALUE")))
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        assert table.now == 2.0
-        assert [each.param_value for each in port.of("PARAM_VALUE")] == [2.0]
-
-    asyncio.run(go())
+async def test_the_link_hands_on_what_others_than_the_autopilot_ask() -> None:
+    port, clock = MemoryPort(), FlightClock()
+    link = AutopilotLink(LinkConfig(), port, clock, lambda _: None, lambda _: None)
+    table = One()
+    requests = GroundRequests(
+        port, clock, CommandServer({}), ParameterServer(table),
+        MissionServer(lambda: np.zeros((3, 3))), lambda _: None,
+    )  # fmt: skip
+    link.on_request = requests.take
+    tasks = [asyncio.ensure_future(each) for each in (link.run(), requests.run())]
+    await asyncio.sleep(0.05)
+    port.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), clock.now_ns())
+    message = mavlink.MAVLink_param_set_message(1, 197, b"ONE", 2.0, 9)
+    port.hear(message, clock.now_ns(), 255, 190)
+    await until(lambda: bool(port.of("PARAM_VALUE")))
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    assert table.now == 2.0
+    assert [each.param_value for each in port.of("PARAM_VALUE")] == [2.0]
 
 
 def test_messages_that_the_dialect_lacks_are_whole_packets() -> None:

@@ -119,133 +119,115 @@ def counts(scene: Scene, wanted: str) -> int:
     return sum(getattr(each, wanted) for each in scene.port.router.counts())
 
 
-def test_what_each_side_says_goes_where_it_should() -> None:
-    async def play() -> None:
-        async with flown() as scene:
-            ground, udp_ground = await scene.tcp_client(), scene.udp_client()
-            udp_ground.send(Speaker(254, 190).heartbeat())  # so that it is known
-            autopilot, gimbal = Speaker(1, 1), Speaker(1, 154)
-            other = Speaker(42, 1)
-            await until(lambda: len(scene.autopilot.hear()) == 1)
-            said = [autopilot.attitude(5), gimbal.heartbeat(), other.attitude(6), unknown(7)]
-            scene.autopilot.send(b"".join(said))
-            await until(lambda: all(ground.heard(raw) and udp_ground.heard(raw) for raw in said))
-            await until(lambda: len(scene.heard.messages) == 3)
-            assert [m.get_srcSystem() for m in scene.heard.messages] == [1, 1, 42]
-            # from us to all
-            scene.port.send(attitude(9))
-            await until(lambda: scene.autopilot.hear()[-1].message_id == 30)
-            ours = scene.autopilot.hear()[-1]
-            assert (ours.system, ours.component) == (1, 197)
-            await until(lambda: ground.heard(ours.raw) and udp_ground.heard(ours.raw))
-            # from a client to the autopilot, and not to the other client or to us
-            asked = Speaker(255, 190).pack(command(1, 1))
-            ground.send(asked + unknown(8))
-            await until(lambda: scene.autopilot.heard(asked) and scene.autopilot.heard(unknown(8)))
-            assert not udp_ground.heard(asked)
-            assert len(scene.heard.messages) == 3
-
-    asyncio.run(play())
+async def test_what_each_side_says_goes_where_it_should() -> None:
+    async with flown() as scene:
+        ground, udp_ground = await scene.tcp_client(), scene.udp_client()
+        udp_ground.send(Speaker(254, 190).heartbeat())  # so that it is known
+        autopilot, gimbal = Speaker(1, 1), Speaker(1, 154)
+        other = Speaker(42, 1)
+        await until(lambda: len(scene.autopilot.hear()) == 1)
+        said = [autopilot.attitude(5), gimbal.heartbeat(), other.attitude(6), unknown(7)]
+        scene.autopilot.send(b"".join(said))
+        await until(lambda: all(ground.heard(raw) and udp_ground.heard(raw) for raw in said))
+        await until(lambda: len(scene.heard.messages) == 3)
+        assert [m.get_srcSystem() for m in scene.heard.messages] == [1, 1, 42]
+        # from us to all
+        scene.port.send(attitude(9))
+        await until(lambda: scene.autopilot.hear()[-1].message_id == 30)
+        ours = scene.autopilot.hear()[-1]
+        assert (ours.system, ours.component) == (1, 197)
+        await until(lambda: ground.heard(ours.raw) and udp_ground.heard(ours.raw))
+        # from a client to the autopilot, and not to the other client or to us
+        asked = Speaker(255, 190).pack(command(1, 1))
+        ground.send(asked + unknown(8))
+        await until(lambda: scene.autopilot.heard(asked) and scene.autopilot.heard(unknown(8)))
+        assert not udp_ground.heard(asked)
+        assert len(scene.heard.messages) == 3
 
 
-def test_what_a_client_asks_of_us_comes_to_us() -> None:
-    async def play() -> None:
-        async with flown() as scene:
-            client, speaker = await scene.tcp_client(), Speaker(255, 190)
-            to_us, to_all = speaker.pack(command(1, 197)), speaker.pack(command(1, 0))
-            client.send(to_us + to_all + speaker.heartbeat())
-            await until(lambda: len(scene.autopilot.hear()) == 2)
-            assert scene.autopilot.heard(to_all)
-            assert not scene.autopilot.heard(to_us)
-            assert [m.get_type() for m in scene.heard.messages] == ["COMMAND_LONG"] * 2
-            scene.port.identity = (1, 191)
-            client.send(speaker.pack(command(1, 197)))
-            await until(lambda: len(scene.autopilot.hear()) == 3)
-            assert len(scene.heard.messages) == 2
-
-    asyncio.run(play())
+async def test_what_a_client_asks_of_us_comes_to_us() -> None:
+    async with flown() as scene:
+        client, speaker = await scene.tcp_client(), Speaker(255, 190)
+        to_us, to_all = speaker.pack(command(1, 197)), speaker.pack(command(1, 0))
+        client.send(to_us + to_all + speaker.heartbeat())
+        await until(lambda: len(scene.autopilot.hear()) == 2)
+        assert scene.autopilot.heard(to_all)
+        assert not scene.autopilot.heard(to_us)
+        assert [m.get_type() for m in scene.heard.messages] == ["COMMAND_LONG"] * 2
+        scene.port.identity = (1, 191)
+        client.send(speaker.pack(command(1, 197)))
+        await until(lambda: len(scene.autopilot.hear()) == 3)
+        assert len(scene.heard.messages) == 2
 
 
-def test_packets_do_not_go_in_circles() -> None:
-    async def play() -> None:
-        async with flown() as scene:
-            first, second = await scene.tcp_client(), await scene.tcp_client()
-            telling = Speaker(1, 154).heartbeat()
-            scene.autopilot.send(telling)
-            await until(lambda: first.heard(telling) and second.heard(telling))
-            first.send(telling)  # what it got, sent back
-            ground = Speaker(255, 190).heartbeat()
-            first.send(ground)
-            second.send(ground)  # the same from two, who are joined elsewhere
-            second.send(Speaker(1, 197).heartbeat())  # us
-            scene.autopilot.send(Speaker(1, 1).heartbeat())
-            await until(lambda: len(scene.heard.messages) == 2)
-            second.send(Speaker(1, 1).pack(command(1, 197)))  # the autopilot's name
-            await until(lambda: counts(scene, "n_refused") == 4)
-            assert [packet.raw for packet in scene.autopilot.hear()] == [ground]
-            scene.autopilot.send(Speaker(1, 197).attitude(3))  # an echo
-            await asyncio.sleep(0.02)
-            assert not any(packet.component == 197 for packet in first.hear())
-            assert len(scene.heard.messages) == 2
-            scene.autopilot.send(Speaker(1, 197).heartbeat())  # an echo, or another companion
-            await until(lambda: len(scene.heard.messages) == 3)
-            assert not any(packet.component == 197 for packet in first.hear())
-
-    asyncio.run(play())
+async def test_packets_do_not_go_in_circles() -> None:
+    async with flown() as scene:
+        first, second = await scene.tcp_client(), await scene.tcp_client()
+        telling = Speaker(1, 154).heartbeat()
+        scene.autopilot.send(telling)
+        await until(lambda: first.heard(telling) and second.heard(telling))
+        first.send(telling)  # what it got, sent back
+        ground = Speaker(255, 190).heartbeat()
+        first.send(ground)
+        second.send(ground)  # the same from two, who are joined elsewhere
+        second.send(Speaker(1, 197).heartbeat())  # us
+        scene.autopilot.send(Speaker(1, 1).heartbeat())
+        await until(lambda: len(scene.heard.messages) == 2)
+        second.send(Speaker(1, 1).pack(command(1, 197)))  # the autopilot's name
+        await until(lambda: counts(scene, "n_refused") == 4)
+        assert [packet.raw for packet in scene.autopilot.hear()] == [ground]
+        scene.autopilot.send(Speaker(1, 197).attitude(3))  # an echo
+        await asyncio.sleep(0.02)
+        assert not any(packet.component == 197 for packet in first.hear())
+        assert len(scene.heard.messages) == 2
+        scene.autopilot.send(Speaker(1, 197).heartbeat())  # an echo, or another companion
+        await until(lambda: len(scene.heard.messages) == 3)
+        assert not any(packet.component == 197 for packet in first.hear())
 
 
-def test_clients_may_ask_the_autopilot_the_time_but_not_tell_it_theirs() -> None:
-    async def play() -> None:
-        async with flown() as scene:
-            client, speaker = await scene.tcp_client(), Speaker(255, 190)
-            question = mavlink.MAVLink_timesync_message(0, 12345)
-            for v1 in (False, True):
-                client.send(speaker.pack(mavlink.MAVLink_timesync_message(7, 12345), v1=v1))
-                client.send(speaker.pack(question, v1=v1))
-            await until(lambda: counts(scene, "n_refused") == 2)
-            await until(lambda: len(scene.autopilot.hear()) == 2)
-
-    asyncio.run(play())
+async def test_clients_may_ask_the_autopilot_the_time_but_not_tell_it_theirs() -> None:
+    async with flown() as scene:
+        client, speaker = await scene.tcp_client(), Speaker(255, 190)
+        question = mavlink.MAVLink_timesync_message(0, 12345)
+        for v1 in (False, True):
+            client.send(speaker.pack(mavlink.MAVLink_timesync_message(7, 12345), v1=v1))
+            client.send(speaker.pack(question, v1=v1))
+        await until(lambda: counts(scene, "n_refused") == 2)
+        await until(lambda: len(scene.autopilot.hear()) == 2)
 
 
-def test_a_client_that_repeats_itself_is_heard() -> None:
-    async def play() -> None:
-        async with flown() as scene:
-            client = await scene.tcp_client()
-            await scene.tcp_client()
-            constant = Speaker(255, 190).heartbeat()
-            for _ in range(5):
-                client.send(constant)
-            await until(lambda: len(scene.autopilot.hear()) == 5)
-
-    asyncio.run(play())
+async def test_a_client_that_repeats_itself_is_heard() -> None:
+    async with flown() as scene:
+        client = await scene.tcp_client()
+        await scene.tcp_client()
+        constant = Speaker(255, 190).heartbeat()
+        for _ in range(5):
+            client.send(constant)
+        await until(lambda: len(scene.autopilot.hear()) == 5)
 
 
-def test_garbage_never_reaches_the_autopilot_and_ends_the_connection() -> None:
-    async def play() -> None:
-        noise = random.Random(3)
-        async with flown() as scene:
-            bad, good = await scene.tcp_client(), await scene.tcp_client()
-            speaker = Speaker(255, 190)
-            packet = speaker.heartbeat()
-            damaged = bytearray(speaker.pack(command(1, 1)))
-            damaged[20] ^= 1
-            good.send(b"\xfd\xff\x00junk" + packet[:7] + packet + bytes(damaged) + b"\xfe\x09")
-            await asyncio.sleep(0.15)
-            later = speaker.heartbeat()
-            good.send(later)
-            await until(lambda: scene.autopilot.heard(later))
-            with contextlib.suppress(OSError):
-                for _ in range(300):
-                    bad.send(noise.randbytes(1000))
-                    await asyncio.sleep(0.005)
-            await until(lambda: len(scene.port.router.counts()) == 2)  # `good` and the UDP place
-            told = [each for each in scene.port.clients() if not each.connected]
-            assert max(each.n_bad_bytes for each in told) > MOST_GARBAGE  # after it has gone
-            assert len(scene.port.clients()) == 2
-            assert [each.raw for each in scene.autopilot.hear()] == [packet, later]
-
-    asyncio.run(play())
+async def test_garbage_never_reaches_the_autopilot_and_ends_the_connection() -> None:
+    noise = random.Random(3)
+    async with flown() as scene:
+        bad, good = await scene.tcp_client(), await scene.tcp_client()
+        speaker = Speaker(255, 190)
+        packet = speaker.heartbeat()
+        damaged = bytearray(speaker.pack(command(1, 1)))
+        damaged[20] ^= 1
+        good.send(b"\xfd\xff\x00junk" + packet[:7] + packet + bytes(damaged) + b"\xfe\x09")
+        await asyncio.sleep(0.15)
+        later = speaker.heartbeat()
+        good.send(later)
+        await until(lambda: scene.autopilot.heard(later))
+        with contextlib.suppress(OSError):
+            for _ in range(300):
+                bad.send(noise.randbytes(1000))
+                await asyncio.sleep(0.005)
+        await until(lambda: len(scene.port.router.counts()) == 2)  # `good` and the UDP place
+        told = [each for each in scene.port.clients() if not each.connected]
+        assert max(each.n_bad_bytes for each in told) > MOST_GARBAGE  # after it has gone
+        assert len(scene.port.clients()) == 2
+        assert [each.raw for each in scene.autopilot.hear()] == [packet, later]
 
 
 async def steady(scene: Scene, other: Side, seconds: float = 0.5) -> list[float]:
@@ -314,132 +296,118 @@ def flood(client: Side, speaker: Speaker) -> Callable[[], None]:
     return more
 
 
-def test_clients_that_flood_starve_neither_us_nor_another(tmp_path: Path) -> None:
+async def test_clients_that_flood_starve_neither_us_nor_another(tmp_path: Path) -> None:
     """Over a slow line: clients have to share what we leave of it."""
-
-    async def play() -> None:
-        cable = PtyWire(tmp_path / "autopilot")
-        cable.plug()
-        tcp_port, udp_port = free_port(socket.SOCK_STREAM), free_port()
-        port = port_at(f"serial:{cable.link}:57600", (f"tcpin::{tcp_port}", f"udpin::{udp_port}"))
-        heard, got, stream = Heard(), list[Packet](), MavlinkStream()
-        with contextlib.ExitStack() as ends:
-            async with running(port.run(heard)):
-                await until(lambda: port.connected and not port.trouble)
-                nobody = Side(ends.enter_context(udp()))
-                scene = Scene(port, nobody, heard, tcp_port, udp_port, ends)
-                modest = await scene.tcp_client()
-                floods = []
-                for i, client in enumerate([await scene.tcp_client(), scene.udp_client()]):
-                    speaker = Speaker(200 + i, 190)
-                    floods.append(flood(client, speaker))
-                ground, n_said = Speaker(255, 190), 0
-                begun_s = time.monotonic()
-                n_turned_away = 0
-                while (passed_s := time.monotonic() - begun_s) < 1.0 or n_turned_away <= 100:
-                    n_turned_away = counts(scene, "n_dropped_in")
-                    for more in floods:
-                        more()
-                    if passed_s * 20 > n_said:
-                        modest.send(ground.heartbeat())
-                        port.send(attitude(n_said))
-                        n_said += 1
-                    await asyncio.sleep(0.005)
-                    for data in cable.receive():
-                        got += stream.feed(data, 0)
-                await asyncio.sleep(0.1)
+    cable = PtyWire(tmp_path / "autopilot")
+    cable.plug()
+    tcp_port, udp_port = free_port(socket.SOCK_STREAM), free_port()
+    port = port_at(f"serial:{cable.link}:57600", (f"tcpin::{tcp_port}", f"udpin::{udp_port}"))
+    heard, got, stream = Heard(), list[Packet](), MavlinkStream()
+    with contextlib.ExitStack() as ends:
+        async with running(port.run(heard)):
+            await until(lambda: port.connected and not port.trouble)
+            nobody = Side(ends.enter_context(udp()))
+            scene = Scene(port, nobody, heard, tcp_port, udp_port, ends)
+            modest = await scene.tcp_client()
+            floods = []
+            for i, client in enumerate([await scene.tcp_client(), scene.udp_client()]):
+                speaker = Speaker(200 + i, 190)
+                floods.append(flood(client, speaker))
+            ground, n_said = Speaker(255, 190), 0
+            begun_s = time.monotonic()
+            n_turned_away = 0
+            while (passed_s := time.monotonic() - begun_s) < 1.0 or n_turned_away <= 100:
+                n_turned_away = counts(scene, "n_dropped_in")
+                for more in floods:
+                    more()
+                if passed_s * 20 > n_said:
+                    modest.send(ground.heartbeat())
+                    port.send(attitude(n_said))
+                    n_said += 1
+                await asyncio.sleep(0.005)
                 for data in cable.receive():
                     got += stream.feed(data, 0)
-                sources = [packet.system for packet in got]
-                assert sources.count(1) == n_said  # all of ours
-                assert sources.count(255) >= n_said - 4  # and the other client's
-                for flooder in (200, 201):
-                    assert sources.count(flooder) > 5
-                n_bytes = sum(len(packet.raw) for packet in got)
-                assert n_bytes < 5760 * (passed_s + 0.25)
-                assert port.n_dropped == 0
-                assert stream.n_bad_bytes == 0
-        cable.unplug()
-
-    asyncio.run(play())
-
-
-def test_a_thousand_connections_leave_nothing_behind() -> None:
-    async def play() -> None:
-        async with flown() as scene:
-            good = await scene.tcp_client()
-            good.send(Speaker(255, 190).heartbeat())
-            await until(lambda: len(scene.autopilot.hear()) == 1)
-            address = HOST, scene.tcp_port
-
-            async def attack() -> None:
-                for i in range(1000):
-                    with socket.socket() as one:
-                        one.setblocking(False)
-                        with contextlib.suppress(OSError):
-                            one.connect(address)
-                    if i % 20 == 0:
-                        await asyncio.sleep(0.01)
-
-            async with running(attack()) as attacking:
-                latencies = await steady(scene, good)
-                await attacking
-            assert sorted(latencies)[len(latencies) // 2] < 0.005
-            assert len(scene.port.router.counts()) <= MOST_CONNECTIONS + 1
-
-    asyncio.run(play())
+            await asyncio.sleep(0.1)
+            for data in cable.receive():
+                got += stream.feed(data, 0)
+            sources = [packet.system for packet in got]
+            assert sources.count(1) == n_said  # all of ours
+            assert sources.count(255) >= n_said - 4  # and the other client's
+            for flooder in (200, 201):
+                assert sources.count(flooder) > 5
+            n_bytes = sum(len(packet.raw) for packet in got)
+            assert n_bytes < 5760 * (passed_s + 0.25)
+            assert port.n_dropped == 0
+            assert stream.n_bad_bytes == 0
+    cable.unplug()
 
 
-def test_an_idle_connection_is_closed_for_a_new_one() -> None:
-    async def play() -> None:
-        async with flown() as scene:
-            clients = [await scene.tcp_client() for _ in range(MOST_CONNECTIONS)]
-            clients[0].send(Speaker(255, 190).heartbeat())
-            await until(lambda: len(scene.autopilot.hear()) == 1)
-            late = await scene.tcp_client()
-            await until(lambda: scene.port.router.n_rejected == 1)
+async def test_a_thousand_connections_leave_nothing_behind() -> None:
+    async with flown() as scene:
+        good = await scene.tcp_client()
+        good.send(Speaker(255, 190).heartbeat())
+        await until(lambda: len(scene.autopilot.hear()) == 1)
+        address = HOST, scene.tcp_port
+
+        async def attack() -> None:
+            for i in range(1000):
+                with socket.socket() as one:
+                    one.setblocking(False)
+                    with contextlib.suppress(OSError):
+                        one.connect(address)
+                if i % 20 == 0:
+                    await asyncio.sleep(0.01)
+
+        async with running(attack()) as attacking:
+            latencies = await steady(scene, good)
+            await attacking
+        assert sorted(latencies)[len(latencies) // 2] < 0.005
+        assert len(scene.port.router.counts()) <= MOST_CONNECTIONS + 1
+
+
+async def test_an_idle_connection_is_closed_for_a_new_one() -> None:
+    async with flown() as scene:
+        clients = [await scene.tcp_client() for _ in range(MOST_CONNECTIONS)]
+        clients[0].send(Speaker(255, 190).heartbeat())
+        await until(lambda: len(scene.autopilot.hear()) == 1)
+        late = await scene.tcp_client()
+        await until(lambda: scene.port.router.n_rejected == 1)
+        packet = Speaker(1, 1).attitude(1)
+        await asyncio.sleep(0.05)
+        scene.autopilot.send(packet)
+        await until(lambda: clients[0].heard(packet) and late.heard(packet))
+        with contextlib.suppress(BlockingIOError):
+            assert clients[1].socket.recv(1000) == b""
+
+
+async def test_clients_that_come_before_the_autopilot_are_there_when_it_comes(
+    tmp_path: Path,
+) -> None:
+    cable = PtyWire(tmp_path / "autopilot")
+    tcp_port = free_port(socket.SOCK_STREAM)
+    port = port_at(f"serial:{cable.link}:57600", (f"tcpin::{tcp_port}",))
+    with contextlib.ExitStack() as ends:
+        async with running(port.run(Heard())):
+            scene = Scene(port, Side(ends.enter_context(udp())), Heard(), tcp_port, 0, ends)
+            await until(lambda: port.router._listeners[0].port != 0)
+            client = await scene.tcp_client()
+            client.send(Speaker(255, 190).heartbeat())
+            await until(lambda: port.n_dropped == 1)
+            cable.plug()
+            await until(lambda: port.connected)
             packet = Speaker(1, 1).attitude(1)
-            await asyncio.sleep(0.05)
-            scene.autopilot.send(packet)
-            await until(lambda: clients[0].heard(packet) and late.heard(packet))
-            with contextlib.suppress(BlockingIOError):
-                assert clients[1].socket.recv(1000) == b""
-
-    asyncio.run(play())
+            cable.send(packet)
+            await until(lambda: client.heard(packet))
+    cable.unplug()
 
 
-def test_clients_that_come_before_the_autopilot_are_there_when_it_comes(tmp_path: Path) -> None:
-    async def play() -> None:
-        cable = PtyWire(tmp_path / "autopilot")
-        tcp_port = free_port(socket.SOCK_STREAM)
-        port = port_at(f"serial:{cable.link}:57600", (f"tcpin::{tcp_port}",))
-        with contextlib.ExitStack() as ends:
-            async with running(port.run(Heard())):
-                scene = Scene(port, Side(ends.enter_context(udp())), Heard(), tcp_port, 0, ends)
-                await until(lambda: port.router._listeners[0].port != 0)
-                client = await scene.tcp_client()
-                client.send(Speaker(255, 190).heartbeat())
-                await until(lambda: port.n_dropped == 1)
-                cable.plug()
-                await until(lambda: port.connected)
-                packet = Speaker(1, 1).attitude(1)
-                cable.send(packet)
-                await until(lambda: client.heard(packet))
-        cable.unplug()
-
-    asyncio.run(play())
-
-
-def test_a_place_that_is_taken_is_named_and_the_rest_works() -> None:
-    async def play() -> None:
-        with udp() as taken:
-            scene_port = taken.getsockname()[1]
-            port = port_at(f"udpin:{HOST}:{free_port()}", (f"udpin::{scene_port}",))
-            async with running(port.run(Heard())):
-                await until(lambda: f"udpin:{HOST}:{scene_port}: Address already" in port.trouble)
-                assert port.connected
-
-    asyncio.run(play())
+async def test_a_place_that_is_taken_is_named_and_the_rest_works() -> None:
+    with udp() as taken:
+        scene_port = taken.getsockname()[1]
+        port = port_at(f"udpin:{HOST}:{free_port()}", (f"udpin::{scene_port}",))
+        async with running(port.run(Heard())):
+            await until(lambda: f"udpin:{HOST}:{scene_port}: Address already" in port.trouble)
+            assert port.connected
 
 
 def test_clients_that_are_none_are_refused() -> None:
@@ -447,27 +415,23 @@ def test_clients_that_are_none_are_refused() -> None:
         port_at("udpin::14550", ("tcp:1.2.3.4:5",))
 
 
-def test_with_a_key_clients_must_sign_too(tmp_path: Path) -> None:
+async def test_with_a_key_clients_must_sign_too(tmp_path: Path) -> None:
     key = bytes(range(32))
     (tmp_path / "key").write_text(key.hex())
-
-    async def play() -> None:
-        async with flown(key_file=str(tmp_path / "key")) as scene:
-            client = await scene.tcp_client()
-            client.send(Speaker(255, 190).heartbeat())
-            await until(lambda: counts(scene, "n_refused") == 1)
-            stamp = (time.time_ns() - 1_420_070_400 * 10**9) // 10_000
-            packet = Speaker(255, 190, key).pack(heartbeat(), stamp)
-            client.send(packet)
-            await until(lambda: [p.raw for p in scene.autopilot.hear()] == [packet])
-            # what the autopilot says is the clients' own to judge
-            unsigned = Speaker(1, 1).heartbeat()
-            scene.autopilot.send(unsigned)
-            await until(lambda: client.heard(unsigned))
-            assert scene.heard.messages == []
-            assert (scene.port.n_unsigned, scene.port.n_bad) == (1, 1)
-
-    asyncio.run(play())
+    async with flown(key_file=str(tmp_path / "key")) as scene:
+        client = await scene.tcp_client()
+        client.send(Speaker(255, 190).heartbeat())
+        await until(lambda: counts(scene, "n_refused") == 1)
+        stamp = (time.time_ns() - 1_420_070_400 * 10**9) // 10_000
+        packet = Speaker(255, 190, key).pack(heartbeat(), stamp)
+        client.send(packet)
+        await until(lambda: [p.raw for p in scene.autopilot.hear()] == [packet])
+        # what the autopilot says is the clients' own to judge
+        unsigned = Speaker(1, 1).heartbeat()
+        scene.autopilot.send(unsigned)
+        await until(lambda: client.heard(unsigned))
+        assert scene.heard.messages == []
+        assert (scene.port.n_unsigned, scene.port.n_bad) == (1, 1)
 
 
 def test_splitting_fails_on_what_is_no_packet() -> None:

@@ -137,22 +137,16 @@ def test_each_scrape_reads_the_health_of_its_moment() -> None:
     assert asyncio.run(test()) == [84, -1]
 
 
-def test_only_loopback_listens() -> None:
-    async def test() -> None:
-        async with served() as (port, _):
-            with socket.socket() as other:
-                other.bind(("127.0.0.2", port))  # would be in use, were it 0.0.0.0
-
-    asyncio.run(test())
+async def test_only_loopback_listens() -> None:
+    async with served() as (port, _):
+        with socket.socket() as other:
+            other.bind(("127.0.0.2", port))  # would be in use, were it 0.0.0.0
 
 
-def test_a_port_in_use_is_named() -> None:
-    async def test() -> None:
-        async with served() as (port, _):
-            with pytest.raises(ConfigError, match=f"prometheus_port: 127.0.0.1:{port}: "):
-                await Metrics(port, lambda: HEALTH, print).start()
-
-    asyncio.run(test())
+async def test_a_port_in_use_is_named() -> None:
+    async with served() as (port, _):
+        with pytest.raises(ConfigError, match=f"prometheus_port: 127.0.0.1:{port}: "):
+            await Metrics(port, lambda: HEALTH, print).start()
 
 
 @pytest.mark.parametrize(
@@ -180,26 +174,22 @@ def test_other_questions_get_short_answers(request_: bytes, status: bytes) -> No
     assert asyncio.run(test()).split()[1] == status
 
 
-def test_clients_that_ask_nothing_hold_a_place_for_a_short_time(
+async def test_clients_that_ask_nothing_hold_a_place_for_a_short_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(short_answers, "TIMEOUT_S", 0.2)
-
-    async def test() -> None:
-        async with served() as (port, _):
-            stuck = [
-                await asyncio.open_connection("127.0.0.1", port)
-                for _ in range(3 * short_answers.MAX_CLIENTS)
-            ]
-            await asyncio.sleep(0.3)
-            assert "companion_uptime_seconds" in await asyncio.to_thread(get, port)
-            for _, writer in stuck:
-                writer.close()
-
-    asyncio.run(test())
+    async with served() as (port, _):
+        stuck = [
+            await asyncio.open_connection("127.0.0.1", port)
+            for _ in range(3 * short_answers.MAX_CLIENTS)
+        ]
+        await asyncio.sleep(0.3)
+        assert "companion_uptime_seconds" in await asyncio.to_thread(get, port)
+        for _, writer in stuck:
+            writer.close()
 
 
-def test_a_fault_in_health_is_told_and_survived() -> None:
+async def test_a_fault_in_health_is_told_and_survived() -> None:
     faults = iter([True, False])
 
     def health() -> Health:
@@ -207,11 +197,8 @@ def test_a_fault_in_health_is_told_and_survived() -> None:
             raise RuntimeError("no health")
         return HEALTH
 
-    async def test() -> None:
-        async with served(health) as (port, warned):
-            with pytest.raises((OSError, urllib.error.URLError)):
-                await asyncio.to_thread(get, port)
-            assert warned == ["RuntimeError: no health"]
-            assert "companion_uptime_seconds" in await asyncio.to_thread(get, port)
-
-    asyncio.run(test())
+    async with served(health) as (port, warned):
+        with pytest.raises((OSError, urllib.error.URLError)):
+            await asyncio.to_thread(get, port)
+        assert warned == ["RuntimeError: no health"]
+        assert "companion_uptime_seconds" in await asyncio.to_thread(get, port)
