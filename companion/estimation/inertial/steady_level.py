@@ -94,8 +94,13 @@ class SteadyLevel:
 
     @property
     def lead_hz(self) -> float:
-        """Gain by which the level is led to the autopilot's."""
-        wanders = float(np.sqrt(self._noise / (2.0 * AUTOPILOT_S)))
+        """Gain by which the level is led to the autopilot's.
+
+        That is by the same gyroscopes: it is off by the same for no longer than their noise lets
+        it, and it was integrated from samples of which some do not come.
+        """
+        same_s = min(AUTOPILOT_S, SIGMA_AUTOPILOT_RAD**2 / self._noise)
+        wanders = float(np.sqrt(self._noise / (2.0 * same_s)))
         sigma_bias = float(np.sqrt(max(self._covariance[3, 3], self._covariance[4, 4])))
         return (wanders + sigma_bias) / SIGMA_AUTOPILOT_RAD
 

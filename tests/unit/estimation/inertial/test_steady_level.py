@@ -17,10 +17,11 @@ HEADING = rotation_from_vector(np.array([0.0, 0.0, 1.0]))
 class Hover:
     """A body that rocks; its gyroscopes have a bias, and the autopilot's level drifts by it."""
 
-    def __init__(self, bias_rad_s: Array) -> None:
+    def __init__(self, bias_rad_s: Array, noise_rad_s: float = 0.0) -> None:
         self.turns = TurnIntegral()
         self.level = SteadyLevel(self.turns)
         self.bias_rad_s, self.t_ns = bias_rad_s, 0
+        self.noise_rad_s, self.rng = noise_rad_s, np.random.default_rng(1)
 
     def true(self) -> Array:
         """`ned_from_body` (3, 3) now."""
@@ -36,6 +37,7 @@ class Hover:
             before = self.true()
             self.t_ns += STEP_NS
             rates = vector_from_rotation(before.T @ self.true()) * 100.0 + self.bias_rad_s
+            rates = rates + self.noise_rad_s * self.rng.standard_normal(3)
             drifted = drift_rad_s * (self.t_ns - begin_ns) * 1e-9 + jump_rad
             autopilot = rotation_from_vector(np.array([drifted, 0.0, 0.0])) @ self.true()
             sample = ImuSample(self.t_ns, rates, np.zeros(3))
@@ -65,6 +67,14 @@ def test_it_lasts_where_the_level_of_the_autopilot_drifts() -> None:
 
 def test_without_images_it_is_the_level_of_the_autopilot() -> None:
     assert Hover(BIAS).fly(3.0, seen=False) < np.radians(0.1)
+
+
+def test_gyroscopes_that_are_noisy_tell_no_level_of_their_own() -> None:
+    """As in PX4's simulator: 0.09 rad/s in each sample, half a degree in each second."""
+    hover = Hover(np.zeros(3), noise_rad_s=0.09)
+    hover.fly(10.0, seen=True)
+    off_rad = [hover.fly(0.5, seen=False) for _ in range(20)]
+    assert np.sqrt(np.mean(np.square(off_rad))) < np.radians(0.3)
 
 
 def test_a_correction_of_the_map_is_no_bias() -> None:
