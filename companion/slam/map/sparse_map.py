@@ -88,10 +88,15 @@ class SlamMap(MapPoints):
     _quarantine_age: int = 0
 
     def leave_behind(self, keyframe: Keyframe) -> None:
-        """Let ids that a keyframe names be as they are, and refine its features no more."""
+        """Let ids that a keyframe names be as they are, and refine its features no more.
+
+        It names none but those of living points, whose rows would else never be used again.
+        """
+        self.clear_dead_observations([keyframe])
+        ids = keyframe.point_ids
+        keyframe.refined_for = np.where(keyframe.refined_for == ids, ids, -1)
         keyframe.is_far, keyframe.grey = True, None
-        for ids in (keyframe.point_ids, keyframe.refined_for):
-            self.is_named[ids[ids >= 0]] = True
+        self.is_named[ids[ids >= 0]] = True
 
     def recycle_ids(self) -> None:
         """Recycle ids of points removed long ago; called once per keyframe."""
@@ -119,6 +124,7 @@ class SlamMap(MapPoints):
         keyframe.point_ids[features] = points
         self.observers[points, self.n_observers[points] % N_OBSERVERS_KEPT] = keyframe.keyframe_id
         np.add.at(self.n_observers, points, 1)
+        self.is_named[points] |= keyframe.is_far
 
     def move_observation(self, keyframe: Keyframe, feature: int, point: int) -> None:
         """As `add_observations` of one feature that observes another point until now."""
@@ -126,6 +132,7 @@ class SlamMap(MapPoints):
         keyframe.point_ids[feature] = point
         self.observers[point, self.n_observers[point] % N_OBSERVERS_KEPT] = keyframe.keyframe_id
         self.n_observers[point] += 1
+        self.is_named[point] |= keyframe.is_far
 
     def remove_observations(self, keyframe: Keyframe, features: Ints) -> None:
         """Remove observations of a keyframe; points left with fewer than two are removed."""

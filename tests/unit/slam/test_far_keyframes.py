@@ -12,6 +12,7 @@ import pytest
 
 from companion.geometry.transforms import Similarity
 from companion.products.array_file import ArrayFile
+from companion.slam.features.orb_features import Ints
 from companion.slam.features.patches import image_levels
 from companion.slam.loop.loop_closure import LoopDetector
 from companion.slam.loop.map_merge import close_loop, loop_graph, merge_maps
@@ -133,20 +134,45 @@ def test_a_full_disk_leaves_all_in_memory(tmp_path: Path) -> None:
     assert_same(flown_round(None), flown_round(Full()))
 
 
-def test_ids_that_far_keyframes_name_are_not_used_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def recycling(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.slam.map.sparse_map.MIN_POINTS_RECYCLED", 0)
     monkeypatch.setattr("companion.slam.map.sparse_map.ID_QUARANTINE_KEYFRAMES", 1)
+
+
+def unnamed(slam_map: SlamMap, keyframe: Keyframe) -> Ints:
+    """Points that a keyframe names, but none that is left behind."""
+    return np.setdiff1d(keyframe.point_ids, np.flatnonzero(slam_map.is_named))
+
+
+@pytest.mark.usefixtures("recycling")
+def test_ids_that_far_keyframes_name_are_not_used_again(tmp_path: Path) -> None:
     away = flown_round(ArrayFile(tmp_path))
     far, near = away.keyframes[0], away.keyframes[max(away.keyframes)]
     named = np.setdiff1d(far.point_ids, near.point_ids)
-    alone = np.setdiff1d(near.point_ids, far.point_ids)
-    alone = alone[~away.is_named[alone]]
-    assert len(named) and len(alone)
-    away.alive[named] = away.alive[alone] = False
+    alone, later = np.array_split(unnamed(away, near), [-5])
+    away.add_observations(far, np.arange(4), later[:4])
+    away.move_observation(far, 4, int(later[4]))
+    assert len(named) and len(alone) and len(later) == 5
+    away.alive[np.concatenate([named, later, alone])] = False
     for _ in range(3):
         away.recycle_ids()
     assert set(alone.tolist()) <= set(away._free_ids)
-    assert set(away._free_ids).isdisjoint(named.tolist())
-    assert (far.point_ids == named[0]).any() and not np.isin(near.point_ids, alone).any()
+    assert set(away._free_ids).isdisjoint([*named.tolist(), *later.tolist()])
+    assert (far.point_ids == named[-1]).any() and not np.isin(near.point_ids, alone).any()
+
+
+@pytest.mark.usefixtures("recycling")
+def test_dead_points_of_a_keyframe_that_is_left_behind_are_used_again(tmp_path: Path) -> None:
+    away = flown_round(ArrayFile(tmp_path))
+    near = away.keyframes[max(away.keyframes)]
+    dead, alive = np.array_split(unnamed(away, near), 2)
+    near.refined_for[:] = near.point_ids
+    away.alive[dead] = False
+    away.leave_behind(near)
+    for _ in range(3):
+        away.recycle_ids()
+    assert set(dead.tolist()) <= set(away._free_ids)
+    assert away.is_named[alive].all()
+    np.testing.assert_array_equal(near.refined_for, near.point_ids)
+    assert not np.isin(near.point_ids, dead).any() and np.isin(alive, near.point_ids).all()
