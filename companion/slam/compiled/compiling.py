@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from companion.slam.compiled.shipped_code import FOLDER, ShippedCode, circumstances
 
-Ints = NDArray[np.int64]
+Ints = NDArray[np.signedinteger[Any]]
 Bools = NDArray[np.bool_]
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
@@ -33,8 +33,9 @@ def given(element: Any, dimensions: int) -> Any:
 
 numbers, pairs, matrices = given(number, 1), given(number, 2), given(number, 3)
 integers, tables, flags = given(integer, 1), given(integer, 2), given(flag, 1)
-half_word, small_integer, tiny_word = types.uint32, types.int32, types.uint8
-single_pairs, words = given(types.float32, 2), given(types.uint64, 2)
+large_word, half_word, small_integer = types.uint64, types.uint32, types.int32
+tiny_word = types.uint8
+single_pairs, words = given(types.float32, 2), given(large_word, 2)
 images, patches = given(types.uint8, 2), given(types.uint8, 3)
 
 

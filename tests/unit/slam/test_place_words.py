@@ -7,9 +7,10 @@ import pytest
 
 from companion.messages import Bytes
 from companion.slam.compiled.word_matching import (
-    STRIDE,
-    counted_spans,
+    entries_of,
     equal_spans,
+    marked,
+    marked_spans,
     with_weights,
 )
 from companion.slam.loop import place_recognition
@@ -45,14 +46,17 @@ def test_spans_are_those_of_a_search() -> None:
         assert (begins + counts).tolist() == np.searchsorted(among, words, "right").tolist()
 
 
-def test_spans_are_those_of_counts() -> None:
-    for n, m, most in ((0, 5, 64), (300, 40, 64), (900, 64, 64), (20, 400, 512)):
+def test_spans_of_marked_entries_are_those_of_a_search() -> None:
+    for n, m, most in (
+        (0, 5, 64), (300, 40, 64), (900, 64, 64), (20, 400, 512), (9000, 999, 999), (999, 9, 9)
+    ):  # fmt: skip
         among = np.sort(RANDOM.integers(0, most, n).astype(np.uint32))
         words = np.unique(RANDOM.integers(0, most, m).astype(np.uint32))
-        counts = np.bincount(among, minlength=most)
-        begins = np.r_[0, np.cumsum(counts)[STRIDE - 1 :: STRIDE]]
-        found = counted_spans(counts.astype(np.uint8), begins.astype(np.uint32), words)
-        for one, other in zip(found, equal_spans(among, words), strict=True):
+        marks, begins = marked(among, most)
+        assert entries_of(marks).tolist() == among.tolist()
+        for one, other in zip(
+            marked_spans(marks, begins, words), equal_spans(among, words), strict=True
+        ):
             assert one.tolist() == other.tolist()
 
 
