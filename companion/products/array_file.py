@@ -64,8 +64,7 @@ class ArrayFile:
         segment, kept = self._segments[-1], []
         for each, n_bytes in zip(arrays, padded, strict=True):
             self._write(memoryview(each.reshape(-1).view(np.uint8)))
-            flat = np.frombuffer(segment, each.dtype, each.size, self._at)
-            kept.append(flat.reshape(each.shape))
+            kept.append(np.ndarray(each.shape, each.dtype, segment, self._at))
             self._at += n_bytes
             self.n_bytes += n_bytes
         return kept

@@ -13,9 +13,9 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array
+from companion.slam.features.orb_features import Ints
 
 WINDOW_NS = 10_000_000_000
 SIGMA_CALIBRATION = 0.001
@@ -63,7 +63,7 @@ class OdometryDrift:
         """Forget the path, after a jump."""
         self._path.clear()
 
-    def see(self, born: NDArray[np.int64] | None) -> None:
+    def see(self, born: Ints | None) -> None:
         """Tell known ground from new by the points in view of the frame that comes next.
 
         `born` (N,) are the ids of the keyframes at which they were made; None if unknown.

@@ -7,7 +7,6 @@ of a stationary camera. Here the pose is continuous, and corrections are slew-li
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.estimation.body.aiding import AidedPlace
 from companion.estimation.body.body_filter import BodyFilter, Reckoned
@@ -30,6 +29,7 @@ from companion.estimation.odometry.tracking_quality import FoundAgain, quality_o
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, yaw_angle, yaw_rotation
 from companion.messages import Georeference, Odometry, Track, TrackState
+from companion.slam.features.orb_features import Ints
 
 QUALITY_MARGIN = 1.5
 """Below this, times the least quality that is sent, good inertial navigation counts for more: a
@@ -105,7 +105,7 @@ class SmoothOdometry:
         georeference: Georeference | None,
         velocity_map: ImageVelocity | None,
         first: MapView | None = None,
-        born: NDArray[np.int64] | None = None,
+        born: Ints | None = None,
     ) -> Odometry:
         """Odometry of the frame that has begun.
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array, Similarity
 from companion.messages import Bytes
@@ -41,7 +40,10 @@ class PointArrays(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class MapPoints:
-    """Points by id, the index of their row; the first `n_points` rows are in use."""
+    """Points by id, the index of their row; the first `n_points` rows are in use.
+
+    Types are as narrow as they may be: a flight of an hour leaves near a million points.
+    """
 
     scale_factor: float
     n_levels: int
@@ -53,24 +55,24 @@ class MapPoints:
     """Mean viewing direction (P, 3), from point to camera."""
     base_distance: Array = field(default_factory=lambda: np.zeros(0))
     """Distance (P,) at which the point would be detected at pyramid level 0, map units."""
-    n_visible: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    n_found: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    n_observers: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    observers: Ints = field(default_factory=lambda: np.zeros((0, N_OBSERVERS_KEPT), np.int64))
+    n_visible: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
+    n_found: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
+    n_observers: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
+    observers: Ints = field(default_factory=lambda: np.zeros((0, N_OBSERVERS_KEPT), np.int32))
     """Ids of the latest keyframes to observe the point, unordered, -1 padded; may be outdated."""
-    born: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    born: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     """Id (P,) of the keyframe at which the point was created."""
-    first_seen: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    first_seen: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     """Id (P,) of the keyframe with the reference view of the patch."""
     first_unproject: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
     """Jacobian of the reference view's normalised coordinates by its pixels"""
-    patch_at: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    patch_at: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     """Number (P,) of a point's patch, while the point is alive."""
     patch_centre: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    patch_level: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    patch_level: Ints = field(default_factory=lambda: np.zeros(0, np.int8))
     is_named: Bools = field(default_factory=lambda: np.zeros(0, bool))
     """Points (P,) that far keyframes name, dead or alive: their ids are not recycled."""
-    _number: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    _number: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     """Of some points (P,) from 1 on, while these are looked at; else 0."""
     _marked: Bools = field(default_factory=lambda: np.zeros(0, bool))
     """Some points (P,), while these are looked at."""

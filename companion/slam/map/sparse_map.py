@@ -93,7 +93,7 @@ class SlamMap(MapPoints):
         It names none but those of living points, whose rows would else never be used again.
         """
         self.clear_dead_observations([keyframe])
-        ids = keyframe.point_ids
+        keyframe.point_ids = ids = keyframe.point_ids.astype(np.int32)
         keyframe.refined_for = np.where(keyframe.refined_for == ids, ids, -1)
         keyframe.is_far, keyframe.grey = True, None
         self.is_named[ids[ids >= 0]] = True

@@ -117,7 +117,8 @@ def adjust(
         else:
             damping *= 10
     inlier = ((residual * residual).sum(1) < CHI2_2D) & (p[:, 2] > 0)
-    poses = [Pose(rotation[i], translation[i]) for i in range(len(b.poses))]
+    # copies, as one that a keyframe keeps would keep those of all
+    poses = [Pose(rotation[i].copy(), translation[i].copy()) for i in range(len(b.poses))]
     return AdjustmentResult(poses, points, inlier)
 
 
