@@ -16,6 +16,7 @@ from companion.estimation.attitude_checks import AttitudeChecks
 from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.body_odometry import BodyOdometry
 from companion.estimation.camera_motion import CameraMotion
+from companion.estimation.camera_watch import CameraWatch
 from companion.estimation.flow_of_frames import FlowOfFrames
 from companion.estimation.gate.proof import MAP_RESUMED
 from companion.estimation.georeference.georeferencer import Georeferencer
@@ -23,15 +24,12 @@ from companion.estimation.georeference.segment_georeference import SegmentGeoref
 from companion.estimation.gimbal.gimbal_head import GimbalHead
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.judged_acceleration import JudgedAcceleration
-from companion.estimation.lens.lens_watch import LensWatch
 from companion.estimation.lift_off.optical_flow import FlowMeter
 from companion.estimation.lift_off.standing import Standing
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
-from companion.estimation.odometry.tracking_margin import TrackingMargin
 from companion.estimation.resumption.checkpoint import Checkpoint
 from companion.estimation.resumption.map_resumption import MapResumption
 from companion.estimation.satellites.satellite_watch import SatelliteWatch
-from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
 from companion.estimation.site.site_in_flight import SiteInFlight
 from companion.estimation.site.site_use import DOUBTED, SiteUse
 from companion.estimation.telemetry_intake import TelemetryIntake
@@ -123,9 +121,9 @@ class LocalisationStage:
             self._tracker, self._attitude, self._gimbal, self._motion, self._georeferences,
             self._odometry, self._smooth,
         )  # fmt: skip
-        self._shutter = None if camera.readout_ms == 0 else ShutterOfFrames(camera)
-        self._lens = LensWatch(camera)
-        self._margin = TrackingMargin(camera, config.features.n_features)
+        self._watch = CameraWatch(
+            camera, config.features.n_features, self._tracker, self._attitude, self._motion, times
+        )
         self._t_ns = 0
         self._telemetry = TelemetryIntake(
             config.telemetry.use, self._gimbal, self._standing, flow, self._smooth.ground,
@@ -236,26 +234,10 @@ class LocalisationStage:
         with self._tracker.map_lock.tracking():
             self._t_ns = frame.t_ns
             self._take_samples()
-            shutter = self._shutter
-            if shutter is None:
-                yield from self._tracked(frame)
-            else:
-                with self._times("shutter"):
-                    frame = shutter.begin(frame, self._attitude, self._motion)
-                for out in self._tracked(frame):
-                    if isinstance(out, Track) and out.seq == frame.seq:
-                        out = shutter.of(out)
-                    yield out
-                with self._times("shutter"):
-                    said = shutter.end(self._tracker.view_of(frame.seq), self._tracker.map)
-                yield from said
-            if self._gimbal is None and self._lens.watches:
-                with self._times("lens"):
-                    said = self._lens.end(
-                        self._tracker.view_of(frame.seq), self._tracker.map,
-                        self._attitude.correction[0],
-                    )  # fmt: skip
-                yield from said
+            frame = self._watch.begin(frame)
+            for out in self._tracked(frame):
+                yield self._watch.of(out, frame.seq)
+            yield from self._watch.end(frame.seq)
             yield self._frame_tracked(frame.t_ns, frame.seq, has_picture=True)
         yield from self._flow.of(frame)
 
@@ -330,15 +312,12 @@ class LocalisationStage:
         yield from self._imu.warnings()
         yield from self._georeferencer.warnings()
         if not stands:
-            tracker = self._tracker
-            yield from self._margin.take(
-                next(m for m in tracked if isinstance(m, Track) and m.seq == frame.seq),
-                tracker.view_of(frame.seq), tracker.map, tracker.n_features, tracker.feature_ratio,
-                tracker.nearly_drowned,
-            )  # fmt: skip
+            track = next(m for m in tracked if isinstance(m, Track) and m.seq == frame.seq)
+            yield from self._watch.limits(track)
+            slam_map = self._tracker.map
             self._satellites.take_frame(
-                frame.t_ns, tracker.map.first_keyframe_id, self._tracks.seen,
-                self._georeferences.of(tracker.map), self._margin.is_near,
+                frame.t_ns, slam_map.first_keyframe_id, self._tracks.seen,
+                self._georeferences.of(slam_map), self._watch.near_limits,
             )  # fmt: skip
         yield from self._satellites.warnings()
         yield from self._checks.check(frame.t_ns)

@@ -12,9 +12,11 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from companion.app.progress import Progress
 from companion.app.replay.obstacles_again import ObstaclesAgain
-from companion.app.replay.sent_again import SentAgain, steps_as_tracked
+from companion.app.replay.sent_again import Payloads, SentAgain, steps_as_tracked
 from companion.config import Config
 from companion.errors import FlightError, StageError
 from companion.estimation.gate.gate_journal import OBSTACLES
@@ -43,7 +45,7 @@ from companion.products.site_map_file import digest_of, map_path, read_head, rea
 from companion.timing.clock import StageTimes
 from drivers.recording.decisions import Decisions, decisions_of
 from drivers.recording.flights_folder import RECORDING
-from drivers.recording.recorded_flight import open_recording
+from drivers.recording.recorded_flight import RecordedFlight, open_recording
 
 AS_FLOWN = "as_flown.json"
 
@@ -61,25 +63,17 @@ def replay_as_flown(
     flight = open_recording(path, config.camera, config.telemetry)
     try:
         told = decisions_of(flight.recording)
-        tracked = Tracked(told.odometry, told.targets, told.flows)
-        steps = told.gates
         if told.lossless:
-            site = _site_of(told, config, flight.camera)
-            n = flight.n_frames_between(flight.start_ns, flight.stop_ns)
-            progress.start(n)
-            tracked = _tracked_again(flight.camera, told, site, flight.frames(), progress)
-            progress.finish()
-            steps = list(steps_as_tracked(steps, tracked.places, tracked.verdicts))
+            tracked = _tracked_again(flight, told, config, progress)
         else:
+            tracked = Tracked(told.odometry, told.targets, told.flows)
             notify(
                 "images were compressed with losses: the recorded odometry, landing targets and "
                 "optical flow go to the gates"
             )
-        made = SentAgain(told, tracked.odometry, tracked.targets, tracked.flows).payloads(steps)
-        if tracked.obstacles is not None:
-            made[OBSTACLES] = tracked.obstacles.payloads
     finally:
         flight.recording.close()
+    made = _made_again(told, tracked)
     by_gate = {
         gate: _compared(made.get(gate, []), told.sent.get(gate, []))
         for gate in sorted({*made, *told.sent} & {step.gate for step in told.gates})
@@ -103,13 +97,7 @@ def replay_as_flown(
         notify(f"{n_tracked} of {len(told.odometry)} frames have the same odometry")
         if told.targets:
             notify(f"{n_seen} of {len(told.targets)} frames have the same landing target")
-    for gate, each in by_gate.items():
-        if each["same"] < max(each["sent"], each["made_again"]):
-            raise StageError(
-                f"{path}: {each['sent']} messages of the gate `{gate}` were sent, "
-                f"{each['made_again']} are made again; number {each['same'] + 1} is the first that "
-                "differs"
-            )
+    _check_same(path, by_gate)
     for gate, n in not_made.items():
         why = (
             "they are found in images, which were compressed with losses"
@@ -121,6 +109,16 @@ def replay_as_flown(
     notify(
         f"{totals['same']} messages were sent ({parts}); made again, each is the same to the byte"
     )
+
+
+def _check_same(path: Path, by_gate: Mapping[str, Mapping[str, int]]) -> None:
+    for gate, each in by_gate.items():
+        if each["same"] < max(each["sent"], each["made_again"]):
+            raise StageError(
+                f"{path}: {each['sent']} messages of the gate `{gate}` were sent, "
+                f"{each['made_again']} are made again; number {each['same'] + 1} is the first that "
+                "differs"
+            )
 
 
 @dataclass
@@ -173,18 +171,30 @@ def _site_of(told: Decisions, config: Config, camera: Camera) -> SiteUse | None:
     return SiteUse(read_site_map(path).site, camera, origin=None, is_live=True)
 
 
+def _made_again(told: Decisions, tracked: Tracked) -> Payloads:
+    """Messages by their gates, of what was tracked."""
+    steps = told.gates
+    if told.lossless:
+        steps = list(steps_as_tracked(steps, tracked.places, tracked.verdicts))
+    made = SentAgain(told, tracked.odometry, tracked.targets, tracked.flows).payloads(steps)
+    if tracked.obstacles is not None:
+        made[OBSTACLES] = tracked.obstacles.payloads
+    return made
+
+
 def _tracked_again(
-    camera: Camera, told: Decisions, site: SiteUse | None, frames: Iterator[object],
-    progress: Progress,
-) -> Tracked:  # fmt: skip
+    flight: RecordedFlight, told: Decisions, config: Config, progress: Progress
+) -> Tracked:
     """All that the stages give, of the frames that they took in flight."""
+    camera = flight.camera
     stage = LocalisationStage(
         told.config, camera, StageTimes(), background=True,
-        order=[step.mapping_point for step in told.frames], site=site,
+        order=[step.mapping_point for step in told.frames], site=_site_of(told, config, camera),
     )  # fmt: skip
+    progress.start(flight.n_frames_between(flight.start_ns, flight.stop_ns))
     _take_up(stage, told, camera)
     found = Tracked(obstacles=ObstaclesAgain(told, camera))
-    pictures = _looked_at(frames, camera, told, found)
+    pictures = _looked_at(flight.frames(), camera, told, found)
     n_taken = 0
     try:
         for n_done, step in enumerate(told.frames):
@@ -211,6 +221,7 @@ def _tracked_again(
             pass
     finally:
         stage.finish(adjust=False)
+    progress.finish()
     return found
 
 
@@ -258,17 +269,16 @@ def _compared(made: list[tuple[int, bytes]], sent: list[tuple[int, bytes]]) -> d
 def _same(made: Odometry | None, recorded: Odometry) -> bool:
     if made is None:
         return False
-    if made.world_from_body is None or recorded.world_from_body is None:
-        return made.world_from_body is recorded.world_from_body
-    return bool(
-        (made.world_from_body.translation == recorded.world_from_body.translation).all()
-        and (made.world_from_body.rotation == recorded.world_from_body.rotation).all()
+    ours, theirs = made.world_from_body, recorded.world_from_body
+    if ours is None or theirs is None:
+        return ours is theirs
+    return np.array_equal(ours.translation, theirs.translation) and np.array_equal(
+        ours.rotation, theirs.rotation
     )
 
 
 def _same_target(made: LandingTarget | None, recorded: LandingTarget) -> bool:
     if made is None or made.why_not != recorded.why_not:
         return False
-    if made.position_body_m is None or recorded.position_body_m is None:
-        return made.position_body_m is recorded.position_body_m
-    return bool((made.position_body_m == recorded.position_body_m).all())
+    ours, theirs = made.position_body_m, recorded.position_body_m
+    return ours is theirs if ours is None or theirs is None else np.array_equal(ours, theirs)

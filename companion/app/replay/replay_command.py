@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -125,22 +125,20 @@ def replay(
     map fails, all frames are tracked and written with the cloud so far; then StageError.
     """
     camera, log = given.flight.camera, given.log
-    watched, sent = Watched(), PosesSent(config)
-    landing = LandingSent(config) if config.landing.marker != "off" else None
+    watched = Watched()
     live: LiveViewer | None = None
+    sent: list[PosesSent | LandingSent] = [PosesSent(config)]
     names = ("localisation", "depth", "results") if config.depth.enabled else LEAST
-    if landing is not None:
+    if config.landing.marker != "off":
+        sent.append(LandingSent(config))
         names = (*names, "landing")
     of_map = map_origin(config)
     setup = Setup(config, camera, out, origin=log.origin, is_live=False)
+    takers: list[Callable[[Message], None]] = [watched.take, *(each.take for each in sent)]
 
     def watch(message: Message) -> None:
-        watched.take(message)
-        sent.take(message)
-        if landing is not None:
-            landing.take(message)
-        if live is not None:
-            live.take(message)
+        for take in takers:
+            take(message)
 
     with ExitStack() as stack:
         stages = InOrder(map(stage_named, names), setup, watch, notify, apart=("depth", "results"))
@@ -153,24 +151,17 @@ def replay(
                 return Finish(hurry=False, save_map=save)
             if stage.name != "results":
                 return Finish(hurry=False)
-            dropped = {"frames": 0, "depth frames": 0}
-            if live is not None:
-                dropped["viewer messages"] = live.n_dropped
-            return Finish(hurry=False, facts=RunFacts(
-                stage_times=stages.times, wall_s=monotonic_s() - began_s, clock=log.clock,
-                origin=watched.origin(log.origin, of_map),
-                device=stages.progress("depth").device if config.depth.enabled else NO_DEPTH,
-                config=shown(config), versions=versions(), command=command_shown(sys.argv),
-                peak_memory_mb=stages.peak_memory_mb, camera=camera, n_frames_total=given.n_frames,
-                completed=completed, dropped=dropped, rates_hz=dict(log.rates_hz),
-                believed=config.telemetry.use,
-            ))  # fmt: skip
+            origin, wall_s = watched.origin(log.origin, of_map), monotonic_s() - began_s
+            dropped = {} if live is None else {"viewer messages": live.n_dropped}
+            facts = _facts(given, config, stages, origin, wall_s, completed, dropped)
+            return Finish(hurry=False, facts=facts)
 
         try:
             if viewer != "none":
                 live = stack.enter_context(
                     LiveViewer(config.viewer, camera, viewer, origin=log.origin)
                 )
+                takers.append(live.take)
                 if live.page:
                     notify(f"viewer: open {live.page}")
             progress.start(given.n_frames)
@@ -186,9 +177,8 @@ def replay(
             try:
                 stages.finish(finish)
             finally:
-                sent.write(out)
-                if landing is not None:
-                    landing.write(out)
+                for each in sent:
+                    each.write(out)
     if config.depth.enabled and stages.progress("depth").details["failures"]:
         notify(f"dense map: {stages.progress('depth').device}")
     if stages.depth_fault is not None:
@@ -197,6 +187,22 @@ def replay(
             f"{in_words(stages.depth_fault)}; path, report and the cloud so far are in {out}"
         ) from stages.depth_fault
     watched.check(out)
+
+
+def _facts(
+    given: RecordedInput, config: Config, stages: InOrder, origin: GeoOrigin | None,
+    wall_s: float, completed: bool, dropped: Mapping[str, int],
+) -> RunFacts:  # fmt: skip
+    """Facts of a replay for its report."""
+    return RunFacts(
+        stage_times=stages.times, wall_s=wall_s, clock=given.log.clock, origin=origin,
+        device=stages.progress("depth").device if config.depth.enabled else NO_DEPTH,
+        config=shown(config), versions=versions(), command=command_shown(sys.argv),
+        peak_memory_mb=stages.peak_memory_mb, camera=given.flight.camera,
+        n_frames_total=given.n_frames, completed=completed,
+        dropped={"frames": 0, "depth frames": 0, **dropped}, rates_hz=dict(given.log.rates_hz),
+        believed=config.telemetry.use,
+    )  # fmt: skip
 
 
 def map_origin(config: Config) -> GeoOrigin | None:

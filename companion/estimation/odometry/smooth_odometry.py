@@ -22,7 +22,12 @@ from companion.estimation.odometry.odometry_course import (
     FLOOR_RAD,
     OdometryCourse,
 )
-from companion.estimation.odometry.odometry_frame import MapView, OdometryState, drift_m
+from companion.estimation.odometry.odometry_frame import (
+    MapView,
+    OdometryFrame,
+    OdometryState,
+    drift_m,
+)
 from companion.estimation.odometry.stand import Stand
 from companion.estimation.odometry.tracked_velocity import tracked_velocity
 from companion.estimation.odometry.tracking_quality import FoundAgain, quality_of
@@ -139,8 +144,9 @@ class SmoothOdometry:
         self, track: Track, segment: int, georeference: Georeference | None,
         velocity_map: ImageVelocity | None, first: MapView | None, quality: int,
     ) -> Odometry:  # fmt: skip
+        """Odometry by the map; by inertial navigation where that is better, or no map known."""
         course, flown = self._course, self._course.flown
-        pose, reckoned = track.map_from_camera, self.reckoning.reckoned
+        pose = track.map_from_camera
         known = track.state in (TrackState.TRACKING, TrackState.DEAD_RECKONING)
         if not known or pose is None:
             return course.reckoned(track)
@@ -162,7 +168,7 @@ class SmoothOdometry:
         assert flown.placed is not None
         raw = flown.placed.world_from_body(pose)
         if track.state is TrackState.DEAD_RECKONING:
-            if reckoned is not None:
+            if self.reckoning.reckoned is not None:
                 return course.reckoned(track)
             return course.dead_reckoned(track, pose, raw, georeference)
         doubtful = course.rough(georeference.sigma_scale) or not self.found_again.certain
@@ -172,36 +178,18 @@ class SmoothOdometry:
             return course.reckoned(track)
         image_m = track.sigma_position * georeference.world_from_map.scale
         noise_m = NOISE_INFLATION * image_m
-        if self._stands(track.t_ns, flown.frame.from_world @ raw):
-            self._aid(track.t_ns, flown.frame.from_world @ raw, georeference, noise_m)
-            return course.none(Track(track.seq, track.t_ns, TrackState.LOST))
         here = flown.frame.from_world @ raw  # also where dead reckoning was off
+        if self._stands(track.t_ns, here):
+            self._aid(track.t_ns, here, georeference, noise_m)
+            return course.none(Track(track.seq, track.t_ns, TrackState.LOST))
         seen_again = course.dead_reckoning
         if seen_again:
             self._starts.reacquire(raw, track.t_ns)
-        frame, last = flown.frame, flown.last
-        if last is not None:
-            dt_s = min((track.t_ns - last.t_ns) * 1e-9, 1.0)
-            span_s = 0.0 if first is None else (track.t_ns - first.t_ns) * 1e-9
-            within_m = drift_m(georeference.residual_m, span_s)
-            frame = self._heading.turned(
-                frame.slewed(raw, dt_s, within_m), track.t_ns, raw,
-                None if attitude is None else attitude.ned_from_body, course.reset_counter, dt_s,
-            )  # fmt: skip
+        frame = self._corrected_frame(track.t_ns, raw, georeference, first)
         placed = frame.from_world @ raw
-        within_gate = last is None or course.gate.reachable(
-            last.place_m, placed.translation, track.t_ns - last.t_ns, course.velocity
-        )
-        as_reckoned = seen_again and self.reckoning.may_be_at(placed.translation)
-        if not (within_gate or as_reckoned) and not course.gate.agree(
-            placed.translation, track.t_ns, course.velocity
-        ):
+        if not self._accepted(track.t_ns, placed.translation, seen_again):
             return course.reckoned(track)
         flown.frame = frame
-        ceased = reckoned is None and course.gate.refused_ns(track.t_ns) >= MIN_CONSISTENT_NS
-        if not within_gate or ceased:
-            course.reset()
-        course.gate.clear()
         course.body.move(placed.rotation @ here.rotation.T, here.translation, placed.translation)
         if attitude is not None:
             turned = pose.rotation @ flown.camera_from_body.rotation
@@ -214,18 +202,56 @@ class SmoothOdometry:
         )  # fmt: skip
         course.velocity, sigma_velocity = found or (course.velocity, float("inf"))
         flown.last = LastPose(track.t_ns, pose, placed, noise_m)
+        return self._given(track, placed, georeference, image_m, sigma_velocity, quality)
+
+    def _corrected_frame(
+        self, t_ns: int, raw: Pose, georeference: Georeference, first: MapView | None
+    ) -> OdometryFrame:
+        """Frame of the odometry with a body at `raw` in the world, slewed as time allows."""
+        flown, attitude = self._course.flown, self.reckoning.attitude
+        if flown.last is None:
+            return flown.frame
+        dt_s = min((t_ns - flown.last.t_ns) * 1e-9, 1.0)
+        span_s = 0.0 if first is None else (t_ns - first.t_ns) * 1e-9
+        within_m = drift_m(georeference.residual_m, span_s)
+        return self._heading.turned(
+            flown.frame.slewed(raw, dt_s, within_m), t_ns, raw,
+            None if attitude is None else attitude.ned_from_body, self._course.reset_counter, dt_s,
+        )  # fmt: skip
+
+    def _accepted(self, t_ns: int, place_m: Array, seen_again: bool) -> bool:
+        """True if the gate lets a place (3,) pass, after a reset where the pose jumps to it."""
+        course, last = self._course, self._course.flown.last
+        within_gate = last is None or course.gate.reachable(
+            last.place_m, place_m, t_ns - last.t_ns, course.velocity
+        )
+        as_reckoned = seen_again and self.reckoning.may_be_at(place_m)
+        if not (within_gate or as_reckoned or course.gate.agree(place_m, t_ns, course.velocity)):
+            return False
+        refused_long = course.gate.refused_ns(t_ns) >= MIN_CONSISTENT_NS
+        if not within_gate or (refused_long and self.reckoning.reckoned is None):
+            course.reset()
+        course.gate.clear()
+        return True
+
+    def _given(
+        self, track: Track, placed: Pose, georeference: Georeference, image_m: float,
+        sigma_velocity: float, quality: int,
+    ) -> Odometry:  # fmt: skip
+        """A tracked pose of the body with its uncertainty; `image_m` is that by the image alone."""
+        course, sigma_scale = self._course, georeference.sigma_scale
         drift = course.drift.add(
-            track.t_ns, placed.translation, georeference.sigma_scale, frame.slewed_m, image_m
+            track.t_ns, placed.translation, sigma_scale, course.flown.frame.slewed_m, image_m
         )  # without the errors of points: what the drift hands on
         noise_rad = NOISE_INFLATION * track.sigma_rotation_rad
         return Odometry(
             track.seq, track.t_ns, track.state, course.reset_counter,
             quality, placed, course.velocity.copy(),
-            float(np.linalg.norm([FLOOR_M, noise_m, *drift])),
-            float(np.hypot(sigma_velocity, course.sigma_by_scale_m_s(georeference.sigma_scale))),
+            float(np.linalg.norm([FLOOR_M, NOISE_INFLATION * image_m, *drift])),
+            float(np.hypot(sigma_velocity, course.sigma_by_scale_m_s(sigma_scale))),
             float(np.hypot(FLOOR_RAD, noise_rad)) if self._mounted else float("inf"),
             course.sigma_yaw_rad(georeference, noise_rad),
-            sigma_scale=georeference.sigma_scale, sigma_by_scale_m=drift.by_scale_m,
+            sigma_scale=sigma_scale, sigma_by_scale_m=drift.by_scale_m,
         )  # fmt: skip
 
     def _aid(self, t_ns: int, placed: Pose, georeference: Georeference, noise_m: float) -> None:
