@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -11,10 +10,10 @@ from pathlib import Path
 import cv2
 
 from companion.errors import FlightError
-from companion.geometry.camera import COEFFICIENTS, Camera
 from companion.geometry.transforms import quaternion_from_rotation
 from companion.messages import Frame
 from drivers.flight import Flight
+from drivers.images.camera_document import camera_document
 from drivers.images.frame_source import ImageFolder, Video
 from drivers.images.frame_times import HEADER
 from drivers.telemetry.telemetry_csv import NAME, telemetry_csv
@@ -53,7 +52,7 @@ def _write(flight: Flight, folder: Path, on_progress: Callable[[int], None]) -> 
     listed = _pictures(flight, folder, on_progress)
     rows = [HEADER, *(f"{number},{t_ns}" for number, t_ns in listed)]
     (folder / "frames.csv").write_text("\n".join(rows) + "\n")
-    (folder / "camera.json").write_text(json.dumps(camera_json(flight.camera), indent=1) + "\n")
+    (folder / "camera.json").write_bytes(camera_document(flight.camera))
     if log.samples:
         with (folder / NAME).open("w", encoding="utf-8") as file:
             file.writelines(telemetry_csv(log, flight.warnings))
@@ -68,22 +67,6 @@ def _write(flight: Flight, folder: Path, on_progress: Callable[[int], None]) -> 
             lines.append(f"{stamp} {place} {x:.9f} {y:.9f} {z:.9f} {w:.9f}")
         (folder / "truth" / "world_from_camera.tum").write_text("\n".join(lines) + "\n")
     return len(listed)
-
-
-def camera_json(camera: Camera) -> dict[str, object]:
-    """A camera in the format of `read_calibration`."""
-    said: dict[str, object] = {
-        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
-        "cx": camera.cx, "cy": camera.cy, "distortion_model": camera.distortion.value,
-        **dict(zip(COEFFICIENTS[camera.distortion], camera.coefficients, strict=True)),
-    }  # fmt: skip
-    if camera.body_from_camera is not None:
-        said["body_from_camera"] = camera.body_from_camera.matrix().tolist()
-    if camera.gimbal is not None:
-        said["gimbal"] = camera.gimbal.document()
-    if camera.assumed:
-        said["assumed"] = True
-    return said
 
 
 def _pictures(

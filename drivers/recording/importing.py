@@ -11,11 +11,17 @@ from companion.errors import FlightError
 from companion.messages import Frame, Warned
 from companion.runtime.in_order import in_order_of_time
 from drivers.flight import Flight
-from drivers.recording.camera_document import calibration_bytes, camera_document
+from drivers.images.camera_document import camera_document
 from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
 from drivers.recording.picture_codec import picture_encoder
-from drivers.recording.recorded_content import event_bytes, json_bytes, sample_bytes, sample_topic
+from drivers.recording.recorded_content import (
+    calibration_bytes,
+    event_bytes,
+    json_bytes,
+    sample_bytes,
+    sample_topic,
+)
 from drivers.recording.recorder import CAMERA_JSON, NOTES
 from drivers.recording.recording_topics import CALIBRATION, EVENTS, HEALTH, PROFILE, open_channels
 

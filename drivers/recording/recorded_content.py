@@ -13,12 +13,14 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 
 from companion.flight_notes import GateStep, LinkBytes, ObstaclePoints
+from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Similarity, quaternion_from_rotation
 from companion.messages import (
     FrameTracked,
@@ -41,6 +43,11 @@ from drivers.recording.recording_topics import (
 
 WORLD, MAP = "local_ned", "map"
 """Coordinate frames for Foxglove."""
+_LENS_WORDS = {
+    Distortion.NONE: "",
+    Distortion.RADTAN: "plumb_bob",
+    Distortion.EQUIDISTANT: "equidistant",
+}
 _KINDS = {telemetry_topic(kind): kind for kind in TELEMETRY}
 
 
@@ -160,6 +167,19 @@ def cloud_bytes(chunk: PointChunk, world_from_keyframe: Similarity, metric: bool
     packed[:, 12:15] = chunk.rgb
     packed[:, 15] = np.clip(chunk.confidence * 255, 0, 255)
     message.data = packed.tobytes()
+    return serialised(message)
+
+
+def calibration_bytes(camera: Camera, t_ns: int) -> bytes:
+    """Camera as Foxglove's CameraCalibration."""
+    matrix = camera.matrix()
+    message = CameraCalibration(
+        frame_id="camera", width=camera.width, height=camera.height,
+        distortion_model=_LENS_WORDS[camera.distortion], D=camera.coefficients,
+        K=matrix.ravel().tolist(), R=np.eye(3).ravel().tolist(),
+        P=np.column_stack([matrix, np.zeros(3)]).ravel().tolist(),
+    )  # fmt: skip
+    set_time(message.timestamp, t_ns)
     return serialised(message)
 
 

@@ -15,7 +15,7 @@ from companion.geometry.geodesy import GeoOrigin
 from companion.messages import Bytes, ClockReport, Frame, Warned
 from drivers.flight import Flight
 from drivers.images.calibration_file import assumed_camera
-from drivers.recording.camera_document import camera_of
+from drivers.images.camera_document import camera_of
 from drivers.recording.flights_folder import RECORDING
 from drivers.recording.mcap_file import McapFile
 from drivers.recording.picture_codec import grey_of, still

@@ -29,14 +29,15 @@ from companion.messages import (
     Warned,
 )
 from companion.telemetry import Telemetry
+from drivers.images.camera_document import camera_document
 from drivers.mavlink.wire.packet_stream import MavlinkStream, Packet
-from drivers.recording.camera_document import calibration_bytes, camera_document
 from drivers.recording.disk_writer import DiskWriter, Entry
 from drivers.recording.flights_folder import RECORDING, TLOG
 from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
 from drivers.recording.picture_codec import EncodedPicture, picture_encoder
 from drivers.recording.recorded_content import (
+    calibration_bytes,
     cloud_bytes,
     decision_bytes,
     event_bytes,

@@ -16,7 +16,7 @@ from companion.errors import FlightError, SourceError
 from companion.geometry.camera import Camera
 from companion.messages import Frame
 from companion.telemetry import Telemetry
-from drivers.recording.camera_document import camera_of
+from drivers.images.camera_document import camera_of
 from drivers.recording.flights_folder import recordings_in
 from drivers.recording.mcap_file import DAMAGED, RECORD, McapFile, McapMessage, as_stream
 from drivers.recording.mcap_writer import MAGIC

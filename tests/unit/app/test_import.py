@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,13 @@ from drivers.open_flight import format_of, open_flight
 from drivers.telemetry.telemetry_csv import read_telemetry_csv, telemetry_csv
 from drivers.telemetry.telemetry_log import TelemetryLog
 from tests.support.flights.bags import write_bag
-from tests.support.flights.sequences import Piece, piece, write_euroc, write_remode
+from tests.support.flights.sequences import (
+    Piece,
+    piece,
+    write_euroc,
+    write_flight_folder,
+    write_remode,
+)
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +109,14 @@ def test_euroc_with_a_hole(tmp_path: Path, flown: Piece) -> None:
     assert told[0].startswith("images of the list are missing: 1 of 5")
     truth = np.loadtxt(tmp_path / "out" / "truth" / "world_from_camera.tum")
     np.testing.assert_allclose(truth[3, 1:4], flown.truth[3].translation, atol=1e-6)
+
+
+def test_readout_of_a_rolling_shutter_is_kept(tmp_path: Path, flown: Piece) -> None:
+    write_flight_folder(tmp_path / "flown", flown)
+    stated = tmp_path / "flown" / "camera.json"
+    stated.write_text(json.dumps(json.loads(stated.read_text()) | {"readout_ms": 18.5}))
+    flight, _ = imported(tmp_path / "flown", tmp_path / "out")
+    assert flight.camera.readout_ms == 18.5
 
 
 @pytest.mark.parametrize("origin", [None, GeoOrigin(-35.36, 149.17, 584.0)])

@@ -18,7 +18,7 @@ from drivers.images.calibration_file import (
     read_calibration,
     with_readout,
 )
-from drivers.recording.camera_document import camera_document, camera_of
+from drivers.images.camera_document import camera_document, camera_of
 
 GOOD: dict[str, Any] = {
     "width": 64, "height": 48, "fx": 50.0, "fy": 51.0, "cx": 31.0, "cy": 24.0,

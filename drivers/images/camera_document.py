@@ -1,4 +1,4 @@
-"""Camera model as JSON, exact, in the layout of a flight folder's camera.json; and for Foxglove."""
+"""Camera model as JSON, exact: camera.json of a flight folder, and of a recording."""
 
 from __future__ import annotations
 
@@ -6,18 +6,10 @@ import json
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
 from companion.geometry.camera import COEFFICIENTS, Camera, Distortion
 from companion.geometry.gimbal import Gimbal
 from companion.geometry.transforms import Pose
-from drivers.recording.recorded_content import serialised, set_time
-
-_FOXGLOVE = {
-    Distortion.NONE: "",
-    Distortion.RADTAN: "plumb_bob",
-    Distortion.EQUIDISTANT: "equidistant",
-}
 
 
 def camera_document(camera: Camera) -> bytes:
@@ -33,9 +25,7 @@ def camera_document(camera: Camera) -> bytes:
         document["readout_ms"] = camera.readout_ms
     mount = camera.body_from_camera
     if mount is not None:
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = mount.rotation, mount.translation
-        document["body_from_camera"] = matrix.tolist()
+        document["body_from_camera"] = mount.matrix().tolist()
     if camera.gimbal is not None:
         document["gimbal"] = camera.gimbal.document()
     return (json.dumps(document, indent=1) + "\n").encode()
@@ -63,16 +53,3 @@ def camera_of(document: bytes) -> Camera:
     return Camera(
         width, height, fx, fy, cx, cy, model, coefficients, mount, assumed, readout_ms, gimbal
     )
-
-
-def calibration_bytes(camera: Camera, t_ns: int) -> bytes:
-    """Camera as Foxglove's CameraCalibration."""
-    matrix = camera.matrix()
-    message = CameraCalibration(
-        frame_id="camera", width=camera.width, height=camera.height,
-        distortion_model=_FOXGLOVE[camera.distortion], D=camera.coefficients,
-        K=matrix.ravel().tolist(), R=np.eye(3).ravel().tolist(),
-        P=np.column_stack([matrix, np.zeros(3)]).ravel().tolist(),
-    )  # fmt: skip
-    set_time(message.timestamp, t_ns)
-    return serialised(message)
