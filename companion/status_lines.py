@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 
-from companion.health import Health, SourceHealth, StageHealth
+from companion.health import (
+    FeedbackHealth,
+    FlowHealth,
+    Health,
+    LandingHealth,
+    SourceHealth,
+    StageHealth,
+)
 
 MIN_BETWEEN_LINES_S = 1.0
 """Least interval of lines about changes."""
@@ -30,7 +37,13 @@ class StatusLines:
 
 def line_of(health: Health) -> str:
     """One line for the journal, the most important first."""
-    parts = [_pose(health), _feedback(health), _flow(health), _landing(health), _global(health)]
+    flow, landing, place = health.flow, health.landing, health.global_position
+    within = _in_brackets(place.detail) if place.sending else ""
+    parts = [
+        _pose(health), _feedback(health), _sent("flow", flow, flow.message),
+        _sent("landing marker", landing, landing.marker),
+        _sent("global position", place, place.mode) + within,
+    ]  # fmt: skip
     parts += [_source(source) for source in health.sources]
     parts += [_stage(stage) for stage in health.stages if not stage.alive or stage.n_restarted]
     parts.append(_computer(health))
@@ -75,30 +88,13 @@ def _feedback(health: Health) -> str:
     return f"no feedback: {feedback.why_not or 'not yet'}" + _in_brackets(feedback.detail)
 
 
-def _flow(health: Health) -> str:
-    flow = health.flow
-    if flow.message == "off":
-        return ""
-    if flow.sending:
-        return f"flow {flow.rate_hz:.0f}/s"
-    return f"no flow: {flow.why_not or 'not yet'}"
-
-
-def _landing(health: Health) -> str:
-    if health.landing.marker == "off":
-        return ""
-    if health.landing.sending:
-        return f"landing marker {health.landing.rate_hz:.0f}/s"
-    return f"no landing marker: {health.landing.why_not or 'not yet'}"
-
-
-def _global(health: Health) -> str:
-    given = health.global_position
-    if given.mode == "off":
+def _sent(name: str, given: FlowHealth | LandingHealth | FeedbackHealth, of: str) -> str:
+    """Something else that is sent, unless it is off: that is what it is `of`."""
+    if of == "off":
         return ""
     if given.sending:
-        return f"global position {given.rate_hz:.0f}/s" + _in_brackets(given.detail)
-    return f"no global position: {given.why_not or 'not yet'}"
+        return f"{name} {given.rate_hz:.0f}/s"
+    return f"no {name}: {given.why_not or 'not yet'}"
 
 
 def _computer(health: Health) -> str:

@@ -17,17 +17,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
+
 from companion import __version__
 from companion.app.maps.merged_maps import Pair, merge_flights, merge_pair
 from companion.app.progress import Progress
 from companion.app.replay.replay_command import RecordedInput, replay
-from companion.app.thumbnail import thumbnail
-from companion.config import Config
+from companion.config import CameraConfig, Config
 from companion.config_file import shown
 from companion.errors import CompanionError, InputError
+from companion.messages import Frame
 from companion.products.atomic_file import write_atomically
 from companion.products.report.batch_page import BatchResult, MergedMap, batch_page
+from drivers.open_flight import open_flight
 
+THUMBNAIL_PX, THUMBNAIL_QUALITY = 240, 80
 DONE, INDEX, REPORT, THUMBNAIL = "batch.json", "index.html", "report.json", "thumbnail.jpg"
 CONNECT = "10s"
 """Longest wait for a scheduler that is asked for."""
@@ -204,3 +208,19 @@ def _bytes(path: Path) -> bytes:
         return path.read_bytes()
     except OSError:
         return b""
+
+
+def thumbnail(flight: Path, config: CameraConfig) -> bytes:
+    """JPEG of the middle frame; empty where none can be decoded. FlightError likewise."""
+    opened = open_flight(flight, config)
+    middle_ns = opened.times_ns[opened.n_frames // 2]
+    for frame in opened.frames(middle_ns):
+        if isinstance(frame, Frame):
+            height, width = frame.grey.shape
+            size = THUMBNAIL_PX, max(1, round(height * THUMBNAIL_PX / width))
+            small = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
+            bgr = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
+            return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, THUMBNAIL_QUALITY])[
+                1
+            ].tobytes()
+    return b""

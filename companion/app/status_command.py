@@ -71,15 +71,23 @@ def _pairs(document: Mapping[str, Any]) -> list[str]:
         f"{_number(load.get('temperature_c'), ' C')}",
         f"disk {_number(_scaled(load.get('disk_free_mib'), 1 / 1024), ' GiB', 1)} free",
     ]
+    flow, landing = document.get("flow") or {}, document.get("landing") or {}
+    place = document.get("global_position") or {}
     rows = [
         ("pose", ", ".join(pose)),
         ("scale", document.get("scale") or "not known"),
         *_belief(document.get("believed", MEASUREMENTS)),
         *_refused(document.get("refused") or {}),
         ("feedback", _feedback(document.get("feedback") or {})),
-        *_flow(document.get("flow") or {}),
-        *_landing(document.get("landing") or {}),
-        *_global(document.get("global_position") or {}),
+        *_sent(
+            "flow", flow, "message",
+            flow.get("why_not") or f"quality {flow.get('quality')} of 255", _after_exposure(flow),
+        ),
+        *_sent(
+            "landing", landing, "marker",
+            f"{_number(landing.get('distance_m'), ' m', 1)} away", _after_exposure(landing),
+        ),
+        *_sent("global", place, "mode", str(place.get("detail", NOTHING))),
         ("flight", document.get("flight") or "none"),
         ("reduced", document.get("degraded") or "nothing"),
         ("set", _settings(document.get("set_by_ground") or {})),
@@ -87,7 +95,7 @@ def _pairs(document: Mapping[str, Any]) -> list[str]:
         *_profile(document.get("profile", "none")),
         ("event loop", f"{_number(document.get('loop_delay_p99_ms'), ' ms', 1)} late (p99)"),
         ("running for", _number(document.get("uptime_s"), " s")),
-    ]
+    ]  # fmt: skip
     return [f"{name:12}{value}" for name, value in rows]
 
 
@@ -117,50 +125,23 @@ def _feedback(feedback: Mapping[str, Any]) -> str:
         why = f"held back: {feedback.get('why_not') or 'not yet'}"
         return why + (f" ({detail})" if detail else "")
     return (
-        f"{feedback['mode']}, {_number(feedback.get('rate_hz'), '/s')},"
-        f" {_number(feedback.get('latency_p50_ms'), ' ms')} after exposure"
+        f"{feedback['mode']}, {_number(feedback.get('rate_hz'), '/s')}, {_after_exposure(feedback)}"
         f" ({_number(feedback.get('latency_p95_ms'), ' ms')} p95),"
         f" {feedback.get('n_resets', 0)} resets"
     )
 
 
-def _flow(flow: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Row of the optical flow that is sent, unless it is off."""
-    if flow.get("message", "off") == "off":
-        return []
-    if not flow.get("sending"):
-        return [("flow", f"not sent: {flow.get('why_not') or 'not yet'}")]
-    parts = [
-        str(flow["message"]), _number(flow.get("rate_hz"), "/s"),
-        flow.get("why_not") or f"quality {flow.get('quality')} of 255",
-        f"{_number(flow.get('latency_p50_ms'), ' ms')} after exposure",
-    ]  # fmt: skip
-    return [("flow", ", ".join(parts))]
-
-
-def _landing(landing: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Row of the landing marker, unless none is looked for."""
-    if landing.get("marker", "off") == "off":
-        return []
-    if not landing.get("sending"):
-        return [("landing", f"not sent: {landing.get('why_not') or 'not yet'}")]
-    parts = [
-        str(landing["marker"]), _number(landing.get("rate_hz"), "/s"),
-        f"{_number(landing.get('distance_m'), ' m', 1)} away",
-        f"{_number(landing.get('latency_p50_ms'), ' ms')} after exposure",
-    ]  # fmt: skip
-    return [("landing", ", ".join(parts))]
-
-
-def _global(given: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Row of the global position, unless it is off."""
-    if given.get("mode", "off") == "off":
+def _sent(name: str, given: Mapping[str, Any], key: str, *parts: str) -> list[tuple[str, str]]:
+    """Row of something else that is sent, unless it is off by its `key`."""
+    if given.get(key, "off") == "off":
         return []
     if not given.get("sending"):
-        return [("global", f"not sent: {given.get('why_not') or 'not yet'}")]
-    return [
-        ("global", f"{given['mode']}, {_number(given.get('rate_hz'), '/s')}, {given['detail']}")
-    ]
+        return [(name, f"not sent: {given.get('why_not') or 'not yet'}")]
+    return [(name, ", ".join([str(given[key]), _number(given.get("rate_hz"), "/s"), *parts]))]
+
+
+def _after_exposure(given: Mapping[str, Any]) -> str:
+    return f"{_number(given.get('latency_p50_ms'), ' ms')} after exposure"
 
 
 def _source(source: Mapping[str, Any]) -> tuple[str, ...]:

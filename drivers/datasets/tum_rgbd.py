@@ -13,18 +13,21 @@ import numpy as np
 
 from companion.config import CameraConfig, TelemetryConfig
 from companion.geometry.camera import Camera, Distortion
-from companion.messages import Warned
+from companion.messages import Bytes, Floats, Warned
 from drivers.datasets.posed_layouts import TUM_CAMERA, TUM_CAMERAS
 from drivers.flight import Flight, TruePose
 from drivers.images.calibration_file import read_calibration
-from drivers.images.depth_camera import depths_at_corners
 from drivers.images.listed_images import listed_images
 from drivers.images.picture_file import read_grey, read_picture
-from drivers.images.stereo_pair import Depths
+from drivers.images.stereo_pair import Depths, corners_of
 from drivers.images.text_table import ns_of_seconds, numbers_of, pose_of, read_rows
 from drivers.telemetry.measured_depths import with_depths
 from drivers.telemetry.telemetry_log import Pictures, TelemetryLog, no_telemetry
 
+SIGMA_AT_1_M = 1.425e-3
+"""Grows with the square of the depth (Khoshelham and Elberink 2012, of the first Kinect)."""
+MAX_SPREAD_RATIO = 0.05
+"""Of the 3 x 3 depths about a corner: beyond it lies on an edge, and could be either side's."""
 UNITS_PER_M = np.float32(5000.0)
 SAME_PICTURE_NS = 20_000_000
 """Between stamps of colour and depth, as in the benchmark's own tools."""
@@ -97,3 +100,18 @@ def _truth(path: Path) -> list[TruePose]:
         pose = pose_of(listing, (x, y, z), (qw, qx, qy, qz))
         out.append(TruePose(ns_of_seconds(listing, t), pose))
     return out
+
+
+def depths_at_corners(grey: Bytes, depth_m: Floats) -> Depths:
+    """Depths at corners of a picture (H, W) by a depth image (H, W) in metres, 0 where unknown."""
+    height, width = depth_m.shape
+    at = corners_of(grey)
+    column, row = np.rint(at).astype(int).T
+    inside = (column > 0) & (row > 0) & (column < width - 1) & (row < height - 1)
+    at, column, row = at[inside], column[inside], row[inside]
+    step = np.arange(-1, 2)
+    about = depth_m[row[:, None, None] + step[:, None], column[:, None, None] + step]
+    about = about.reshape(-1, 9).astype(np.float64)
+    ok = (about.min(1) > 0) & (np.ptp(about, axis=1) < MAX_SPREAD_RATIO * about.min(1))
+    found = np.median(about[ok], axis=1)
+    return Depths(at[ok].astype(np.float64), found, SIGMA_AT_1_M * found**2, float("nan"))

@@ -32,6 +32,7 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from http import HTTPStatus
 from typing import Any, get_args
 
@@ -129,24 +130,16 @@ class _HealthCollector(Collector):
 Samples = Mapping[tuple[str, ...], float | None]
 
 
-def _gauge(name: str, says: str, labels: tuple[str, ...], samples: Samples) -> Metric:
-    return _family(GaugeMetricFamily, name, says, labels, samples)
-
-
-def _counter(name: str, says: str, labels: tuple[str, ...], samples: Samples) -> Metric:
-    return _family(CounterMetricFamily, name, says, labels, samples)
-
-
-def _family(kind: Any, name: str, says: str, labels: tuple[str, ...], samples: Samples) -> Metric:
+def _family(kind: Any, name: str, says: str, given: Samples | float | None, *labels: str) -> Metric:
+    """Metric of one number, or of several samples by their labels."""
     family: Metric = kind(f"companion_{name}", says, labels=labels)
-    for values, number in samples.items():
+    for values, number in (given if isinstance(given, Mapping) else {(): given}).items():
         if number is not None:
             family.add_metric(values, number)  # type: ignore[attr-defined]
     return family
 
 
-def _one(number: float | None) -> Samples:
-    return {(): number}
+_gauge, _counter = partial(_family, GaugeMetricFamily), partial(_family, CounterMetricFamily)
 
 
 def _times(number: float | None, factor: float) -> float | None:
@@ -155,84 +148,80 @@ def _times(number: float | None, factor: float) -> float | None:
 
 def _of_flight(health: Health) -> Iterator[Metric]:
     feedback = health.feedback
-    yield _gauge("uptime_seconds", "Since the daemon started.", (), _one(health.uptime_s))
-    yield _gauge("flight_active", "Whether a flight goes on.", (), _one(bool(health.flight)))
-    yield _gauge("tracker_state", "What the tracker does.", ("state",), {(health.tracker,): 1})
-    yield _gauge("pose_quality", "1 to 100; -1 while lost.", (), _one(health.quality))
-    yield _gauge("scale_known", "Whether the map is metric.", (), _one(bool(health.scale)))
+    yield _gauge("uptime_seconds", "Since the daemon started.", health.uptime_s)
+    yield _gauge("flight_active", "Whether a flight goes on.", bool(health.flight))
+    yield _gauge("tracker_state", "What the tracker does.", {(health.tracker,): 1}, "state")
+    yield _gauge("pose_quality", "1 to 100; -1 while lost.", health.quality)
+    yield _gauge("scale_known", "Whether the map is metric.", bool(health.scale))
     yield _gauge(
-        "pose_latency_seconds", "From exposure to pose.", ("quantile",),
-        {("0.95",): _times(health.pose_latency_p95_ms, 1e-3)},
+        "pose_latency_seconds", "From exposure to pose.",
+        {("0.95",): _times(health.pose_latency_p95_ms, 1e-3)}, "quantile",
     )  # fmt: skip
+    yield _gauge("feedback_sending", "Whether the autopilot is given poses.", feedback.sending)
+    yield _gauge("feedback_rate_hz", "Poses sent a second.", feedback.rate_hz)
+    yield _counter("feedback_sent", "Poses sent.", feedback.n_sent)
+    yield _counter("feedback_resets", "Resets announced.", feedback.n_resets)
     yield _gauge(
-        "feedback_sending", "Whether the autopilot is given poses.", (), _one(feedback.sending)
-    )
-    yield _gauge("feedback_rate_hz", "Poses sent a second.", (), _one(feedback.rate_hz))
-    yield _counter("feedback_sent", "Poses sent.", (), _one(feedback.n_sent))
-    yield _counter("feedback_resets", "Resets announced.", (), _one(feedback.n_resets))
-    yield _gauge(
-        "feedback_latency_seconds", "From exposure to sending.", ("quantile",),
+        "feedback_latency_seconds", "From exposure to sending.",
         {
             ("0.5",): _times(feedback.latency_p50_ms, 1e-3),
             ("0.95",): _times(feedback.latency_p95_ms, 1e-3),
         },
+        "quantile",
     )  # fmt: skip
     flow = health.flow
-    yield _gauge("flow_sending", "Whether the autopilot is given flow.", (), _one(flow.sending))
-    yield _gauge("flow_rate_hz", "Flow messages sent a second.", (), _one(flow.rate_hz))
-    yield _counter("flow_sent", "Flow messages sent.", (), _one(flow.n_sent))
-    yield _gauge("degradation_level", "0 where nothing is left out.", (), _one(health.degradation))
+    yield _gauge("flow_sending", "Whether the autopilot is given flow.", flow.sending)
+    yield _gauge("flow_rate_hz", "Flow messages sent a second.", flow.rate_hz)
+    yield _counter("flow_sent", "Flow messages sent.", flow.n_sent)
+    yield _gauge("degradation_level", "0 where nothing is left out.", health.degradation)
     yield _gauge(
-        "event_loop_delay_seconds", "How late the event loop comes.", ("quantile",),
-        {("0.99",): _times(health.loop_delay_p99_ms, 1e-3)},
+        "event_loop_delay_seconds", "How late the event loop comes.",
+        {("0.99",): _times(health.loop_delay_p99_ms, 1e-3)}, "quantile",
     )  # fmt: skip
     yield _counter(
-        "warnings", "Things warned of.", ("what",),
-        {(what,): n for what, n in health.n_warnings.items()},
+        "warnings", "Things warned of.", {(what,): n for what, n in health.n_warnings.items()},
+        "what",
     )  # fmt: skip
 
 
 def _of_sources(health: Health) -> Iterator[Metric]:
-    by, sources = ("source",), health.sources
+    by, sources = "source", health.sources
     yield _gauge(
-        "source_state", "1 for the state it is in.", ("source", "state"),
+        "source_state", "1 for the state it is in.",
         {(s.name, state): s.state == state for s in sources for state in get_args(SourceState)},
+        "source", "state",
     )  # fmt: skip
-    yield _gauge("source_rate_hz", "Rate.", by, {(s.name,): s.rate_hz for s in sources})
-    yield _gauge("source_age_seconds", "Since the last.", by, {(s.name,): s.age_s for s in sources})
-    yield _counter("source_received", "What came.", by, {(s.name,): s.n for s in sources})
-    yield _counter("source_dropped", "Given up.", by, {(s.name,): s.n_dropped for s in sources})
-    yield _counter("source_reopened", "Came back.", by, {(s.name,): s.n_reopened for s in sources})
+    yield _gauge("source_rate_hz", "Rate.", {(s.name,): s.rate_hz for s in sources}, by)
+    yield _gauge("source_age_seconds", "Since the last.", {(s.name,): s.age_s for s in sources}, by)
+    yield _counter("source_received", "What came.", {(s.name,): s.n for s in sources}, by)
+    yield _counter("source_dropped", "Given up.", {(s.name,): s.n_dropped for s in sources}, by)
+    yield _counter("source_reopened", "Came back.", {(s.name,): s.n_reopened for s in sources}, by)
 
 
 def _of_stages(health: Health) -> Iterator[Metric]:
-    by, stages = ("stage",), health.stages
-    yield _gauge("stage_alive", "Whether it runs.", by, {(s.name,): s.alive for s in stages})
-    yield _gauge("stage_rate_hz", "Results a second.", by, {(s.name,): s.rate_hz for s in stages})
+    by, stages = "stage", health.stages
+    yield _gauge("stage_alive", "Whether it runs.", {(s.name,): s.alive for s in stages}, by)
+    yield _gauge("stage_rate_hz", "Results a second.", {(s.name,): s.rate_hz for s in stages}, by)
     latency: dict[tuple[str, ...], float | None] = {}
     for s in stages:
         latency[s.name, "0.5"] = _times(s.latency_p50_ms, 1e-3)
         latency[s.name, "0.95"] = _times(s.latency_p95_ms, 1e-3)
-    yield _gauge(
-        "stage_latency_seconds", "From exposure to result.", ("stage", "quantile"), latency
-    )
-    yield _counter("stage_results", "Results.", by, {(s.name,): s.n for s in stages})
-    yield _counter("stage_dropped", "Not done.", by, {(s.name,): s.n_dropped for s in stages})
-    yield _counter("stage_restarts", "Restarts.", by, {(s.name,): s.n_restarted for s in stages})
+    yield _gauge("stage_latency_seconds", "From exposure to result.", latency, "stage", "quantile")
+    yield _counter("stage_results", "Results.", {(s.name,): s.n for s in stages}, by)
+    yield _counter("stage_dropped", "Not done.", {(s.name,): s.n_dropped for s in stages}, by)
+    yield _counter("stage_restarts", "Restarts.", {(s.name,): s.n_restarted for s in stages}, by)
 
 
 def _of_computer(health: Health) -> Iterator[Metric]:
     load = health.load
-    yield _gauge("cpu_share", "Of all cores.", (), _one(load.cpu_share))
-    yield _gauge("gpu_share", "Of the GPU.", (), _one(load.gpu_share))
-    yield _gauge("memory_used_bytes", "In use.", (), _one(_times(load.memory_used_mib, MIB)))
-    yield _gauge("memory_total_bytes", "In all.", (), _one(_times(load.memory_total_mib, MIB)))
+    yield _gauge("cpu_share", "Of all cores.", load.cpu_share)
+    yield _gauge("gpu_share", "Of the GPU.", load.gpu_share)
+    yield _gauge("memory_used_bytes", "In use.", _times(load.memory_used_mib, MIB))
+    yield _gauge("memory_total_bytes", "In all.", _times(load.memory_total_mib, MIB))
+    yield _gauge("disk_free_bytes", "Where flights are written.", _times(load.disk_free_mib, MIB))
     yield _gauge(
-        "disk_free_bytes", "Where flights are written.", (), _one(_times(load.disk_free_mib, MIB))
-    )
-    yield _gauge(
-        "temperature_celsius", "By sensor.", ("sensor",),
-        {(sensor,): celsius for sensor, celsius in load.temperatures_c.items()},
+        "temperature_celsius", "By sensor.",
+        {(sensor,): celsius for sensor, celsius in load.temperatures_c.items()}, "sensor",
     )  # fmt: skip
     cores: dict[tuple[str, ...], float | None] = {}
     memory: dict[tuple[str, ...], float | None] = {}
@@ -240,5 +229,5 @@ def _of_computer(health: Health) -> Iterator[Metric]:
         name = (process.name,)  # several of one name are one sample
         cores[name] = (cores.get(name) or 0.0) + process.cpu_cores
         memory[name] = (memory.get(name) or 0.0) + process.memory_mib * MIB
-    yield _gauge("process_cpu_cores", "Cores kept busy.", ("process",), cores)
-    yield _gauge("process_memory_bytes", "Resident memory.", ("process",), memory)
+    yield _gauge("process_cpu_cores", "Cores kept busy.", cores, "process")
+    yield _gauge("process_memory_bytes", "Resident memory.", memory, "process")

@@ -12,7 +12,6 @@ import numpy as np
 from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.shutter.readout_estimation import ReadoutEstimator
-from companion.estimation.shutter.scene_plane import scene_plane
 from companion.geometry.camera import Camera
 from companion.geometry.rolling_shutter import Unrolling, shutter_motion
 from companion.geometry.transforms import Array
@@ -20,6 +19,10 @@ from companion.messages import Frame, Track, Warned
 from companion.slam.features.view import View
 from companion.slam.map.sparse_map import SlamMap
 
+MIN_POINTS = 30
+ROUNDS = 5
+HUBER_RATIO = 0.1
+"""Least scale of the weights, of the median inverse depth."""
 LEAST_HALF_SPAN_NS = 10_000_000
 """Attitudes are rounded, and stamped to a millisecond or two: over less their difference is mostly
 that. In such a time a drone turns steadily."""
@@ -144,3 +147,24 @@ class ShutterOfFrames:
         """Stop comparing frames, and let go of the map and the frames that were kept for it."""
         self.watches, self._map = False, None
         self._estimator.reset()
+
+
+def scene_plane(points_camera: Array) -> Array | None:
+    """Plane (3,) by points (N, 3): one over depth is its product with a ray (x, y, 1).
+
+    By least squares with Huber's weights; None with too few points.
+    """
+    points = points_camera[points_camera[:, 2] > 0]
+    if len(points) < MIN_POINTS:
+        return None
+    rays, inverse = points / points[:, 2:], 1.0 / points[:, 2]
+    weight: Array = np.ones(len(points))
+    plane: Array = np.zeros(3)
+    for _ in range(ROUNDS):
+        root = np.sqrt(weight)
+        found = np.linalg.lstsq(rays * root[:, None], inverse * root, rcond=None)[0]
+        plane = np.asarray(found, np.float64)
+        off = np.abs(rays @ plane - inverse)
+        scale = max(1.5 * float(np.median(off)), HUBER_RATIO * float(np.median(inverse)))
+        weight = np.minimum(1.0, scale / np.maximum(off, 1e-12))
+    return plane if np.isfinite(plane).all() else None

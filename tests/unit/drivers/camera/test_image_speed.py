@@ -12,7 +12,7 @@ from companion.telemetry import (
     PositionSource,
     RangeSample,
 )
-from drivers.camera.image_speed import LEAST_HEIGHT_M, OLD_NS, UNKNOWN_RAD_S, ImageSpeed
+from drivers.camera.live_exposure import LEAST_HEIGHT_M, OLD_NS, UNKNOWN_RAD_S, ImageSpeed
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 

@@ -31,10 +31,10 @@ from companion.telemetry import (
 from companion.timing.clock import FlightClock
 from drivers.mavlink import message_rates
 from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.mavlink.clock_exchange import TimesyncMessage, timesync_target
 from drivers.mavlink.commands import NO_ANSWER
 from drivers.mavlink.imu_rate import FEWER, NO_IMU
 from drivers.mavlink.message_rates import MessageRates
-from drivers.mavlink.timesync_message import TimesyncMessage, timesync_target
 from drivers.mavlink.vehicle import vehicle_of
 from drivers.mavlink.wire.link_port import link_port
 from drivers.mavlink.wire.message_port import MavlinkPort

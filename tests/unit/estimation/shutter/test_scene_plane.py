@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.estimation.shutter.scene_plane import scene_plane
+from companion.estimation.shutter.shutter_of_frames import scene_plane
 from companion.geometry.transforms import rotation_from_vector
 
 
