@@ -215,6 +215,7 @@ class LocalisationStage:
                 self._tracker.atlas.mapper_of(segment).adjust_all(
                     OF_LARGE_MAP if is_large else FINAL_ITERATIONS
                 )
+        out += self._tracker.refined(is_over=True)
         if self._segments():
             out.append(self._georeferences.update(self._segments(), self._t_ns, final=True))
         return out
@@ -239,6 +240,7 @@ class LocalisationStage:
                 yield self._watch.of(out, frame.seq)
             yield from self._watch.end(frame.seq)
             yield self._frame_tracked(frame.t_ns, frame.seq, has_picture=True)
+            yield from self._tracker.refined()
         yield from self._flow.of(frame)
 
     def _without_frame(self, overdue: FrameOverdue) -> Iterator[Message]:

@@ -20,6 +20,7 @@ from companion.messages.frame_messages import (
     Odometry,
     OpticalFlow,
     Track,
+    TrackRefined,
     TrackState,
 )
 from companion.messages.map_messages import (
@@ -38,8 +39,8 @@ __all__ = [
     "NO_PICTURE", "SPANS_REACH", "Bytes", "ClockReport", "DepthMap", "Floats", "Frame",
     "FrameOverdue", "FrameTracked", "Georeference", "Georeferenced", "KeyframeAdded",
     "LandingTarget", "LoopClosed", "MapTakenUp", "MapUpdate", "Message", "ObstaclesSeen",
-    "Odometry", "OpticalFlow", "PixelState", "PointChunk", "SiteMapUsed", "Track", "TrackState",
-    "Warned",
+    "Odometry", "OpticalFlow", "PixelState", "PointChunk", "SiteMapUsed", "Track", "TrackRefined",
+    "TrackState", "Warned",
 ]  # fmt: skip
 
 
@@ -66,7 +67,7 @@ class ClockReport:
 
 
 Message = (
-    Frame | Telemetry | Track | Odometry | KeyframeAdded | LoopClosed | MapUpdate | DepthMap
-    | PointChunk | Warned | Georeferenced | FrameTracked | FrameOverdue | OpticalFlow
+    Frame | Telemetry | Track | TrackRefined | Odometry | KeyframeAdded | LoopClosed | MapUpdate
+    | DepthMap | PointChunk | Warned | Georeferenced | FrameTracked | FrameOverdue | OpticalFlow
     | LandingTarget | SiteMapUsed | MapTakenUp | ObstaclesSeen
 )  # fmt: skip

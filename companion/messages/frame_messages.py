@@ -78,6 +78,19 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TrackRefined:
+    """Pose of an earlier frame, in place of that of its Track: its points have been adjusted since.
+
+    `keyframe_from_camera` is relative to keyframe `keyframe_id`, as in Track.
+    """
+
+    seq: int
+    t_ns: int
+    keyframe_id: int
+    keyframe_from_camera: Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
     """Pose of the body for an autopilot: metric, level, and without jumps.
 

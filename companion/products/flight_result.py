@@ -24,6 +24,7 @@ from companion.messages import (
     Odometry,
     PointChunk,
     Track,
+    TrackRefined,
     Warned,
 )
 from companion.products.chunk_store import ChunkStore
@@ -91,6 +92,8 @@ class FlightResult:
             self.last_t_ns = message.t_ns
         elif isinstance(message, Track):
             self._tracks.put(message)
+        elif isinstance(message, TrackRefined):
+            self._tracks.refine(message)
         elif isinstance(message, Odometry):
             self.refused = message.refused
         elif isinstance(message, MapUpdate):

@@ -7,9 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from companion.geometry.transforms import Pose
-from companion.messages import Track, TrackState
+from companion.messages import Track, TrackRefined, TrackState
 
 STATES = tuple(TrackState)
+TRACKING = STATES.index(TrackState.TRACKING)
 NONE = -1
 ROW = np.dtype(
     [
@@ -50,12 +51,22 @@ class TrackStore:
             row["rotation"], row["translation"] = relative.rotation, relative.translation
         self._n += 1
 
+    def refine(self, refined: TrackRefined) -> None:
+        """Replace the pose of a track; nothing where there is none."""
+        for block in reversed(self._blocks):  # mostly in the newest
+            rows = np.flatnonzero((block["seq"] == refined.seq) & (block["state"] == TRACKING))
+            if len(rows):
+                row, relative = block[rows[-1]], refined.keyframe_from_camera
+                row["keyframe_id"] = refined.keyframe_id
+                row["rotation"], row["translation"] = relative.rotation, relative.translation
+                return
+
     def __iter__(self) -> Iterator[Track]:
         """One track per frame, in order of frames."""
         if not self._n:
             return
         rows = np.concatenate(self._blocks)[: self._n]
-        is_tracking = rows["state"] == STATES.index(TrackState.TRACKING)
+        is_tracking = rows["state"] == TRACKING
         # of each frame the last in this order counts
         order = np.lexsort((np.arange(self._n), is_tracking, rows["seq"]))
         seqs = rows["seq"][order]

@@ -29,6 +29,7 @@ from companion.messages import (
     PointChunk,
     SiteMapUsed,
     Track,
+    TrackRefined,
     Warned,
 )
 from companion.runtime.mailbox import DropPolicy
@@ -105,7 +106,10 @@ STAGES = (
     ),
     Stage(
         "topics",
-        (Frame, Odometry, Track, KeyframeAdded, MapUpdate, DepthMap, PointChunk, ObstaclesSeen),
+        (
+            Frame, Odometry, Track, TrackRefined, KeyframeAdded, MapUpdate, DepthMap, PointChunk,
+            ObstaclesSeen,
+        ),
         nice=10, answer_s=30.0, finish_s=15.0, with_flight=True,
     ),
     Stage(
@@ -124,8 +128,8 @@ STAGES = (
     Stage(
         "results",
         (
-            Frame, *TELEMETRY, Warned, Health, GeoOrigin, Track, Odometry, KeyframeAdded,
-            LoopClosed, MapUpdate, DepthMap, PointChunk,
+            Frame, *TELEMETRY, Warned, Health, GeoOrigin, Track, TrackRefined, Odometry,
+            KeyframeAdded, LoopClosed, MapUpdate, DepthMap, PointChunk,
         ),
         nice=10, answer_s=180.0, finish_s=180.0, hurried_s=1.6, with_flight=True, in_folder=True,
     ),

@@ -24,6 +24,7 @@ from companion.messages import (
     Odometry,
     PointChunk,
     Track,
+    TrackRefined,
     Warned,
 )
 from companion.runtime.stage_protocol import Finish, Setup
@@ -100,7 +101,7 @@ class Topics(Work):
 
     def step(self, message: Any) -> Iterable[Message]:
         """Take one message; warns when a node begins or ceases to fetch."""
-        if isinstance(message, (Frame, Track, KeyframeAdded, MapUpdate)):
+        if isinstance(message, (Frame, Track, TrackRefined, KeyframeAdded, MapUpdate)):
             if isinstance(message, MapUpdate):
                 self._update = message
             with self.times("topics"):

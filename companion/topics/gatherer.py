@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from companion.messages import Frame, KeyframeAdded, MapUpdate, Track
+from companion.messages import Frame, KeyframeAdded, MapUpdate, Track, TrackRefined
 from companion.topics.image_jpeg import jpeg_of, without_colour
 from companion.topics.keyframe_bundle import Bundle, MapChange, MapChanges, Picture
 
@@ -39,6 +39,7 @@ class Gatherer:
         self._frames: OrderedDict[int, tuple[int, bytes]] = OrderedDict()
         self._frame_bytes = 0
         self._tracks: list[Track] = []
+        self._refined: list[TrackRefined] = []
         self._keyframes: list[KeyframeAdded] = []
         self._tracked: dict[int, Track] = {}
         self._changes = MapChanges()
@@ -48,7 +49,9 @@ class Gatherer:
         self.keyframe_jpegs: dict[int, bytes] = {}
         """Pictures of the keyframes of the last bundle, by keyframe id."""
 
-    def take(self, message: Frame | Track | KeyframeAdded | MapUpdate) -> Bundle | None:
+    def take(
+        self, message: Frame | Track | TrackRefined | KeyframeAdded | MapUpdate
+    ) -> Bundle | None:
         """Take one message, in the order in which localisation gives it."""
         if isinstance(message, Frame):
             self._wait(message)
@@ -56,6 +59,8 @@ class Gatherer:
             self._tracks.append(message)
             if len(self._tracks) >= MOST_TRACKS:  # none is lost while there are no keyframes
                 return self._bundle(None)
+        elif isinstance(message, TrackRefined):
+            self._refined.append(message)  # of frames of such tracks, and no more than these
         elif isinstance(message, KeyframeAdded):
             self._keyframes.append(message)
         else:
@@ -89,10 +94,11 @@ class Gatherer:
                 self._tracked[track.seq] = track
         pictures = self._pictures() if self._keyframes else []
         bundle = Bundle(
-            self._run, self._number, pictures, self._tracks, self._keyframes, change, over
-        )
+            self._run, self._number, pictures, self._tracks, self._refined, self._keyframes, change,
+            over,
+        )  # fmt: skip
         self._number += 1
-        self._tracks, self._keyframes = [], []
+        self._tracks, self._refined, self._keyframes = [], [], []
         return bundle
 
     def _pictures(self) -> list[Picture]:

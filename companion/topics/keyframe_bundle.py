@@ -14,7 +14,14 @@ import numpy as np
 from companion.errors import StreamError
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Similarity
-from companion.messages import Frame, KeyframeAdded, MapUpdate, Track, TrackState
+from companion.messages import (
+    Frame,
+    KeyframeAdded,
+    MapUpdate,
+    Track,
+    TrackRefined,
+    TrackState,
+)
 from companion.topics.envelope import Envelope
 from companion.topics.image_jpeg import image_of
 from companion.topics.message_codec import (
@@ -67,6 +74,7 @@ class Bundle:
     number: int
     pictures: Sequence[Picture] = ()
     tracks: Sequence[Track] = ()
+    refined: Sequence[TrackRefined] = ()
     keyframes: Sequence[KeyframeAdded] = ()
     change: MapChange | None = None
     over: bool = False
@@ -74,7 +82,10 @@ class Bundle:
     def pack(self) -> bytes:
         """Encoded bytes."""
         fields: dict[str, object] = {"run": self.run, "number": self.number, "over": self.over}
-        arrays = {**_pictures(self.pictures), **_tracks(self.tracks), **_keyframes(self.keyframes)}
+        arrays = {
+            **_pictures(self.pictures), **_tracks(self.tracks), **_refined(self.refined),
+            **_keyframes(self.keyframes),
+        }  # fmt: skip
         fields["map"] = None
         if self.change is not None:
             update = self.change.update
@@ -104,7 +115,8 @@ def bundle_of(envelope: Envelope) -> Bundle:
         change = MapChange(update, removed, part.flag("whole"))
     return Bundle(
         envelope.text("run"), envelope.integer("number", -1), _pictures_of(envelope),
-        _tracks_of(envelope), _keyframes_of(envelope), change, envelope.flag("over"),
+        _tracks_of(envelope), _refined_of(envelope), _keyframes_of(envelope), change,
+        envelope.flag("over"),
     )  # fmt: skip
 
 
@@ -239,6 +251,31 @@ def _tracks_of(envelope: Envelope) -> list[Track]:
         )  # fmt: skip
         out.append(track)
     return out
+
+
+def _refined(refined: Sequence[TrackRefined]) -> dict[str, np.ndarray]:
+    if not refined:
+        return {}
+    return {
+        "refined_seq_t": _pairs([(each.seq, each.t_ns) for each in refined]),
+        "refined_keyframe": np.array([each.keyframe_id for each in refined], np.int32),
+        "refined_from_camera": pose_rows([each.keyframe_from_camera for each in refined]),
+    }
+
+
+def _refined_of(envelope: Envelope) -> list[TrackRefined]:
+    if "refined_keyframe" not in envelope.arrays:
+        return []
+    keyframes = envelope.array("refined_keyframe", "<i4", -1)
+    n = len(keyframes)
+    if n > MOST_TRACKS or (n and keyframes.min() < 0):
+        raise StreamError("bundle: no keyframes of refined frames")
+    rows = envelope.array("refined_from_camera", "<f8", n, 7)
+    pairs = _pairs_of(envelope, "refined", n)
+    return [
+        TrackRefined(seq, t_ns, int(keyframe), known_pose_of(row))
+        for (seq, t_ns), keyframe, row in zip(pairs, keyframes, rows, strict=True)
+    ]
 
 
 def _keyframes(keyframes: Sequence[KeyframeAdded]) -> dict[str, np.ndarray]:

@@ -75,7 +75,7 @@ class RemoteFlight:
             self._numbers.popitem(last=False)
         messages: list[Message] = [frame_of(each, self.camera) for each in bundle.pictures]
         self._n_frames += len(messages)
-        messages += [*bundle.tracks, *bundle.keyframes]
+        messages += [*bundle.tracks, *bundle.refined, *bundle.keyframes]
         if bundle.change is not None:
             self._update = self._mirror.take(bundle.change)
             messages.append(self._update)

@@ -6,7 +6,7 @@ Knows no clock: times come with the frames, durations are measured by the given 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,15 @@ import numpy as np
 from companion.config import Config
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, angle_between
-from companion.messages import Bytes, Frame, KeyframeAdded, LoopClosed, Track, TrackState
+from companion.messages import (
+    Bytes,
+    Frame,
+    KeyframeAdded,
+    LoopClosed,
+    Track,
+    TrackRefined,
+    TrackState,
+)
 from companion.slam.features.faint_pictures import strengthened
 from companion.slam.features.features_ahead import FeaturesAhead
 from companion.slam.features.orb_features import FeatureExtractor, Features
@@ -33,6 +41,7 @@ from companion.slam.mapping.mapping_worker import (
 )
 from companion.slam.tracking.frame_tracker import FrameTracker
 from companion.slam.tracking.map_start import backfill, continue_map, initialise_map
+from companion.slam.tracking.refined_frames import RefinedFrames
 from companion.slam.tracking.tracked_keyframes import TrackedKeyframes
 from companion.timing.clock import Timer
 
@@ -96,6 +105,7 @@ class Tracker:
         )
         self.keyframes = TrackedKeyframes(self.atlas, self._worker, times)
         self._frame_tracker = FrameTracker(self._config, camera, self.atlas)
+        self._refined = RefinedFrames()
         self.state = TrackState.INITIALISING
         self._bootstrap = Bootstrap(camera)
         self._lost_since_ns: int | None = None
@@ -134,6 +144,12 @@ class Tracker:
                 features = self._extractor.extract(strong.corners)
         self.n_features = len(features)
         return self._track_frame(frame, features, prior) + self._worker.done()
+
+    def refined(self, is_over: bool = False) -> Iterator[TrackRefined]:
+        """Refined poses of earlier frames, with the map lock held; at the end of all that wait."""
+        if is_over:
+            return self._refined.rest(self.segments)
+        return self._refined.due(self.keyframes.next_id, self.segments)
 
     def look_ahead(self, grey: Bytes) -> None:
         """Extract the features of the image (H, W) of a frame to come in another thread."""
@@ -213,7 +229,7 @@ class Tracker:
         if not self._worker.busy and keyframes.needed(view):
             keyframes.insert(view)
         assert keyframes.reference is not None
-        return [track_of(self.map, view, keyframes.reference)]
+        return [self._told(view, keyframes.reference)]
 
     # -- initialising ---------------------------------------------------------------------------
 
@@ -263,7 +279,11 @@ class Tracker:
             self._frame_tracker, self._bootstrap.pending, first, second, reference,
             BACKFILLED_IN_FLIGHT if self._is_live else None,
         )  # fmt: skip
-        return [track_of(self.map, view, reference, backfilled=True) for view in views]
+        return [self._told(view, reference, backfilled=True) for view in views]
+
+    def _told(self, view: View, reference: Keyframe, backfilled: bool = False) -> Track:
+        self._refined.add(self.map, view, reference)
+        return track_of(self.map, view, reference, backfilled)
 
     # -- tracking -------------------------------------------------------------------------------
 

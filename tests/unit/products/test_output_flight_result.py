@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.geometry.transforms import angle_between
-from companion.messages import Track, TrackState, Warned
+from companion.geometry.transforms import Pose, angle_between
+from companion.messages import Track, TrackRefined, TrackState, Warned
 from companion.products.flight_result import FlightResult
 from companion.telemetry import PositionSample, PositionSource
 from tests.support.flights import flown
@@ -74,6 +74,24 @@ def test_a_frame_placed_afterwards_replaces_a_lost_one_and_not_the_reverse() -> 
     result.take(Track(lost, flown.time_ns(lost), TrackState.LOST))
     assert lost in [pose.seq for pose in result.poses()]
     assert [track.seq for track in result.tracks] == list(range(flown.N_FRAMES))
+
+
+def test_a_refined_pose_replaces_that_of_its_frame_and_of_no_lost_one() -> None:
+    result = flight()
+    seq, lost = 3 * flown.PER_KEYFRAME + 7, flown.LOST[3]
+    aside = Pose(np.eye(3), np.array([0.0, 0.0, 2.0]))
+    for each in (seq, lost):
+        result.take(TrackRefined(each, flown.time_ns(each), 2, aside))
+    poses = {pose.seq: pose.world_from_camera for pose in result.poses()}
+    assert lost not in poses
+    place = flown.world_from_camera(2 * flown.PER_KEYFRAME)
+    assert np.allclose(poses[seq].rotation, place.rotation)
+    off_m = np.linalg.norm(poses[seq].translation - place.translation)
+    assert off_m == pytest.approx(2.0 * flown.METRES_PER_UNIT)
+    before = flight().tracks[seq]
+    assert (result.tracks[seq].n_inliers, result.tracks[seq].t_ns) == (
+        before.n_inliers, before.t_ns,
+    )  # fmt: skip
 
 
 def test_cloud_is_the_ground_in_its_colours() -> None:

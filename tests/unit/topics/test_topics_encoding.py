@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from companion.errors import StreamError
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Pose
-from companion.messages import ObstaclesSeen, Odometry, PointChunk, TrackState
+from companion.messages import ObstaclesSeen, Odometry, PointChunk, TrackRefined, TrackState
 from companion.topics.camera_fields import camera_fields, camera_of
 from companion.topics.envelope import Envelope, unpack
 from companion.topics.image_jpeg import image_of, jpeg_of, size_of
@@ -153,6 +153,18 @@ def test_motions_of_a_rolling_shutter_come_along_and_impossible_ones_do_not() ->
     assert back[1].shutter_motion is not None
     assert back[1].shutter_motion.ravel().tolist() == list(range(9))
     assert "track_shutter" not in unpack(sent.pack()).arrays
+
+
+def test_refined_poses_come_along_and_such_without_a_keyframe_do_not() -> None:
+    (sent, *_) = topic_flight.bundles(20)
+    pose = sent.tracks[0].keyframe_from_camera
+    assert pose is not None
+    packed = replace(sent, refined=[TrackRefined(3, 5, 1, pose), TrackRefined(4, 6, 2, pose)])
+    back = bundle_of(unpack(packed.pack())).refined
+    assert [(each.seq, each.t_ns, each.keyframe_id) for each in back] == [(3, 5, 1), (4, 6, 2)]
+    assert np.array_equal(back[1].keyframe_from_camera.translation, pose.translation)
+    with pytest.raises(StreamError):
+        bundle_of(unpack(replace(sent, refined=[TrackRefined(3, 5, -1, pose)]).pack()))
 
 
 def test_a_map_is_rebuilt_from_its_changes() -> None:
