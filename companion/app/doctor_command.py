@@ -11,6 +11,7 @@ import json
 import sys
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, TextIO
 
 from companion.advice.imu_room import BITS_PER_BYTE, LOOP_RATE, check_loop_rate, imu_room
@@ -91,8 +92,8 @@ async def _examine(
     only: Collection[str],
     show: Callable[[Examination], None] | None,
 ) -> Examination:
-    feedback, latency_ms = config.feedback, _latency_ms(daemon)
-    mode = "odometry" if feedback.mode == "off" else feedback.mode
+    latency_ms = _latency_ms(daemon)
+    mode = "odometry" if config.feedback.mode == "off" else config.feedback.mode
     patience_s = SEARCH_PATIENCE_S if link_config.url.endswith(":auto") else PATIENCE_S
     async with asking_link(link_config, patience_s) as (link, vehicle, baud):
         firmware = vehicle.firmware
@@ -102,23 +103,7 @@ async def _examine(
                 "its parameters"
             )
         parameters = Parameters(link)
-
-        async def look() -> tuple[list[Finding], int]:
-            ports = line_parameters(firmware) if baud > 0 else ()
-            loop = (LOOP_RATE,) if firmware == ARDUPILOT else ()
-            read = await parameters.read([*names_to_read(firmware), *ports, *loop])
-            values = {name: each.value for name, each in read.items()}
-            findings = advise(
-                firmware, values, feedback, mode, latency_ms, config.gps, config.landing
-            )
-            if baud:
-                camera_hz = config.camera.rate_hz
-                findings += check_line(
-                    firmware, values, config.link, feedback, mode, camera_hz, baud
-                )
-            findings += check_loop_rate(values, config.link)
-            return findings, len(values)
-
+        look = partial(_look, parameters, firmware, config, mode, latency_ms, baud)
         findings, n_examined = await look()
         comes = _heard_by(daemon) or _imu_to_be(config.link, baud, firmware)
         found = Examination(vehicle, link_config.url, mode, findings, n_examined, comes)
@@ -142,6 +127,22 @@ async def _examine(
             except SourceError as error:
                 found.not_stored = f"{error}: leave it on for ten seconds before it is rebooted"
         return found
+
+
+async def _look(
+    parameters: Parameters, firmware: str, config: Config, mode: str, latency_ms: float | None,
+    baud: int,
+) -> tuple[list[Finding], int]:  # fmt: skip
+    """Findings about the parameters as they are now, and the number of these."""
+    ports = line_parameters(firmware) if baud > 0 else ()
+    loop = (LOOP_RATE,) if firmware == ARDUPILOT else ()
+    read = await parameters.read([*names_to_read(firmware), *ports, *loop])
+    values = {name: each.value for name, each in read.items()}
+    feedback, link = config.feedback, config.link
+    findings = advise(firmware, values, feedback, mode, latency_ms, config.gps, config.landing)
+    if baud:
+        findings += check_line(firmware, values, link, feedback, mode, config.camera.rate_hz, baud)
+    return findings + check_loop_rate(values, link), len(values)
 
 
 async def _set(parameters: Parameters, finding: Finding, found: Examination) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from companion.estimation.attitude.camera_attitude import CameraAttitude
-from companion.estimation.body.body_filter import BodyFilter, Reckoned
+from companion.estimation.body.body_filter import BodyFilter
+from companion.estimation.body.body_state import Reckoned
 from companion.estimation.body.reckoning import BodyAttitude
 from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.georeference.georeferencer import Georeferencer

@@ -51,7 +51,7 @@ class CameraWatch:
         tracker = self._tracker
         return self._margin.take(
             track, tracker.view_of(track.seq), tracker.map, tracker.n_features,
-            tracker.feature_ratio, tracker.nearly_drowned,
+            tracker.extractor.feature_ratio, tracker.nearly_drowned,
         )  # fmt: skip
 
     def end(self, seq: int) -> Iterator[Warned]:

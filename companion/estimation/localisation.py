@@ -186,7 +186,7 @@ class LocalisationStage:
 
     def set_effort(self, share: float) -> None:
         """Extract this ratio of the features from now on, under load."""
-        self._tracker.set_feature_ratio(share)
+        self._tracker.extractor.feature_ratio = share
 
     def checkpoint(self) -> Checkpoint | None:
         """State to resume from in another process; None unless the last frame was tracked.
@@ -261,7 +261,7 @@ class LocalisationStage:
         origin, self._origin = self._origin, None
         return FrameTracked(
             t_ns, seq, self._telemetry.n_samples, self._tracker.map_lock.point,
-            self._tracker.feature_ratio, has_picture,
+            self._tracker.extractor.feature_ratio, has_picture,
             None if origin is None or not self._site.in_use else astuple(origin),
         )  # fmt: skip
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +34,7 @@ from companion.estimation.body.body_state import (
     SCALE,
     SIGMA_DRIFT_M_S3,
     BodyState,
+    Reckoned,
     carried_on,
     held,
     propagated,
@@ -68,21 +68,6 @@ MAX_REFUSED_NS = 1_000_000_000
 SHOCK_NS = 500_000_000
 """Rest refused for so long is believed: a blow has stopped the body. Accelerometers sample it too
 seldom to measure it, and what they are off by afterwards is no bias."""
-
-
-class Reckoned(NamedTuple):
-    """Place, velocity (3,) each, local NED, metres, and their standard deviations per axis.
-
-    `start` is what another map's scale can be found from; accelerometers alone have told of the
-    level motion for `unaided_s`.
-    """
-
-    place_m: Array
-    velocity_m_s: Array
-    sigma_place_m: float
-    sigma_velocity_m_s: float
-    start: InertialStart
-    unaided_s: float = 0.0
 
 
 class BodyFilter:

@@ -13,6 +13,7 @@ from companion.estimation.inertial.inertial_motion import (
     SIGMA_TILT_M_S2,
     TILT,
     VELOCITY,
+    InertialStart,
     motion,
 )
 from companion.geometry.transforms import Array
@@ -124,6 +125,21 @@ class BodyState(NamedTuple):
     def sigma(self, part: slice) -> float:
         """The largest standard deviation of a part along an axis."""
         return float(np.sqrt(max(np.diag(self.covariance)[part].max(), 0.0)))
+
+
+class Reckoned(NamedTuple):
+    """Place, velocity (3,) each, local NED, metres, and their standard deviations per axis.
+
+    `start` is what another map's scale can be found from; accelerometers alone have told of the
+    level motion for `unaided_s`.
+    """
+
+    place_m: Array
+    velocity_m_s: Array
+    sigma_place_m: float
+    sigma_velocity_m_s: float
+    start: InertialStart
+    unaided_s: float = 0.0
 
 
 def propagated(state: BodyState, t_ns: int, integral: AccelerationIntegral) -> BodyState | None:

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimation.body.body_filter import BodyFilter, Reckoned
+from companion.estimation.body.body_filter import BodyFilter
+from companion.estimation.body.body_state import Reckoned
 from companion.estimation.body.reckoned_path import BodyPlace, ReckonedPath
 from companion.geometry.transforms import Array, Pose
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.estimation.body.aiding import LEAST_SIGMA_PLACE_M
-from companion.estimation.body.body_filter import Reckoned
+from companion.estimation.body.body_state import Reckoned
 from companion.estimation.body.reckoned_path import BodyPlace
 from companion.estimation.odometry.odometry_frame import MapView, OdometryFrame
 from companion.geometry.transforms import Array, Pose, yaw_angle, yaw_rotation

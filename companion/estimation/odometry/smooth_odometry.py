@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from companion.estimation.body.aiding import AidedPlace
-from companion.estimation.body.body_filter import BodyFilter, Reckoned
+from companion.estimation.body.body_filter import BodyFilter
+from companion.estimation.body.body_state import Reckoned
 from companion.estimation.body.reckoning import BodyAttitude
 from companion.estimation.camera_motion import ImageVelocity
 from companion.estimation.lift_off.ground_aiding import GroundAiding

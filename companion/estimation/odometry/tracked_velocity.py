@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.estimation.body.body_filter import Reckoned
+from companion.estimation.body.body_state import Reckoned
 from companion.estimation.camera_motion import ImageVelocity
 from companion.geometry.transforms import Array
 

@@ -87,8 +87,8 @@ class Tracker:
         self._config = config.tracking
         self._camera = camera
         self._times = times
-        self._extractor = FeatureExtractor(config.features, camera)
-        self._ahead = FeaturesAhead(config.features, camera, self._extractor)
+        self.extractor = FeatureExtractor(config.features, camera)
+        self._ahead = FeaturesAhead(config.features, camera, self.extractor)
         self.n_features = 0
         """Features seen in the last frame,"""
         self.nearly_drowned = False
@@ -141,7 +141,7 @@ class Tracker:
             self._drowned, self.nearly_drowned = strong.drowned, strong.nearly_drowned
             frame = replace(frame, grey=strong.patches)
             if features is None:
-                features = self._extractor.extract(strong.corners)
+                features = self.extractor.extract(strong.corners)
         self.n_features = len(features)
         return self._track_frame(frame, features, prior) + self._worker.done()
 
@@ -177,15 +177,6 @@ class Tracker:
             self._reset()
             self._bootstrap = Bootstrap(self._camera)
             self.state, self._lost_since_ns = TrackState.INITIALISING, None
-
-    @property
-    def feature_ratio(self) -> float:
-        """Ratio of the configured features that is extracted."""
-        return self._extractor.feature_ratio
-
-    def set_feature_ratio(self, share: float) -> None:
-        """Extract this ratio of the configured features from now on."""
-        self._extractor.feature_ratio = share
 
     def stand(self) -> None:
         """The next frame is the first view of a map: the camera has not moved up to it."""

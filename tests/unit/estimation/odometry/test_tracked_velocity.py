@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.estimation.body.body_filter import Reckoned
+from companion.estimation.body.body_state import Reckoned
 from companion.estimation.camera_motion import CameraMotion, ImageVelocity
 from companion.estimation.inertial.inertial_motion import InertialStart
 from companion.estimation.odometry.tracked_velocity import tracked_velocity
