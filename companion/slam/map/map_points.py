@@ -77,7 +77,7 @@ class MapPoints:
     _marked: Bools = field(default_factory=lambda: np.zeros(0, bool))
     """Some points (P,), while these are looked at."""
     patches: PatchStore = field(default_factory=PatchStore)
-    _free_ids: list[int] = field(default_factory=list)
+    _free_ids: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     """Point ids to recycle, the highest last: those of one place lie together."""
 
     def _reserve(self, n: int) -> None:
@@ -99,10 +99,11 @@ class MapPoints:
 
         `levels` is the pyramid of its image. Returns their ids; observations are added separately.
         """
-        again = [self._free_ids.pop() for _ in range(min(len(positions), len(self._free_ids)))]
+        n_left = max(len(self._free_ids) - len(positions), 0)
+        self._free_ids, again = np.split(self._free_ids, [n_left])
         n_more = len(positions) - len(again)
         fresh = np.arange(self.n_points, self.n_points + n_more)
-        ids: Ints = np.concatenate([np.array(again, np.int64), fresh])
+        ids: Ints = np.concatenate([again[::-1], fresh])
         self._reserve(self.n_points + n_more)
         self.n_observers[ids] = 0
         self.positions[ids] = positions

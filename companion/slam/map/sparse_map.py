@@ -84,7 +84,7 @@ class SlamMap(MapPoints):
     held: frozenset[int] = frozenset()
     """Keyframes of an earlier flight, in whose frame the others are placed: nothing moves them."""
     _places: KeyframePlaces = field(default_factory=KeyframePlaces)
-    _quarantined_ids: list[int] = field(default_factory=list)
+    _quarantined_ids: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     _quarantine_age: int = 0
 
     def leave_behind(self, keyframe: Keyframe) -> None:
@@ -107,15 +107,15 @@ class SlamMap(MapPoints):
         n = self.n_points
         known = self.alive[:n].copy()
         known |= self.is_named[:n]
-        known[self._free_ids + self._quarantined_ids] = True
+        free = np.sort(np.concatenate([self._free_ids, self._quarantined_ids]))
+        known[free] = True
         dead = np.r_[~known, False]
         for keyframe in self.keyframes.values():
             if keyframe.is_far:
                 continue
             for ids in (keyframe.point_ids, keyframe.refined_for):
                 ids[dead[ids]] = -1
-        self._free_ids = sorted(self._free_ids + self._quarantined_ids)
-        self._quarantined_ids = np.flatnonzero(~known).tolist()
+        self._free_ids, self._quarantined_ids = free, np.flatnonzero(~known).astype(np.int32)
 
     def add_observations(self, keyframe: Keyframe, features: Ints, points: Ints) -> None:
         """Let `keyframe` observe `points` with `features`, replacing earlier observations."""
