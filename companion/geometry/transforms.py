@@ -101,7 +101,7 @@ class Similarity:
 _IDENTITY = np.eye(3)
 
 
-def _length(v: Array) -> float:
+def length(v: Array) -> float:
     """Norm of one vector, as `np.linalg.norm` has it, without what that asks about its argument."""
     return math.sqrt(v.dot(v))
 
@@ -148,7 +148,7 @@ def rotation_from_vector(rotvec: Array) -> Array:
     array([0., 1., 0.])
     """
     v = np.ascontiguousarray(rotvec, np.float64)
-    theta = _length(v)
+    theta = length(v)
     x, y, z = v.tolist()
     k: Array = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     if theta < 1e-8:
@@ -162,7 +162,7 @@ def vector_from_rotation(rotation: Array) -> Array:
     """Rotation vector (3,) in radians of a rotation (3, 3); the inverse of the above."""
     quaternion = quaternion_from_rotation(rotation)
     w, v = quaternion[0], quaternion[1:].copy()
-    s = _length(v)
+    s = length(v)
     if s < 1e-12:
         return 2.0 * v
     out: Array = v / s * 2.0 * np.arctan2(s, w)
@@ -189,7 +189,7 @@ def vectors_from_rotations(rotations: Array) -> Array:
 def rotation_from_quaternion(quaternion_wxyz: NDArray[Any]) -> Array:
     """Rotation (3, 3) of a quaternion w x y z; it is normalised first."""
     q = np.ascontiguousarray(quaternion_wxyz, np.float64)
-    w, x, y, z = (q / _length(q)).tolist()
+    w, x, y, z = (q / length(q)).tolist()
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -212,7 +212,7 @@ def quaternion_from_rotation(rotation: Array) -> Array:
         q = np.array([c - g, b + d, 1 + 2 * e - t, f + h])
     else:
         q = np.array([d - b, c + g, f + h, 1 + 2 * i - t])
-    q = q / _length(q)
+    q = q / length(q)
     out: Array = -q if q[0] < 0 else q
     return out
 

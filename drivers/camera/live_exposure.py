@@ -61,7 +61,8 @@ class LiveExposure:
 
     def take_telemetry(self, sample: Telemetry) -> None:
         """Add a sample of the vehicle's motion; from any one thread."""
-        self._speed.take(sample)
+        if self._source is not None:  # of others nothing is asked
+            self._speed.take(sample)
 
     def begin(self) -> None:
         """Begin anew with a camera that has just been opened."""

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import LinkConfig
 from companion.geometry.geodesy import STANDARD_GRAVITY_M_S2
-from companion.geometry.transforms import Array, quaternion_from_euler
+from companion.geometry.transforms import Array, length, quaternion_from_euler
 from companion.telemetry import (
     AirspeedSample,
     AttitudeSample,
@@ -113,7 +113,7 @@ def _attitude(message: Any) -> Telemetry:
 
 def _attitude_quaternion(message: Any) -> Telemetry | None:
     q = np.array([message.q1, message.q2, message.q3, message.q4])
-    norm = float(np.linalg.norm(q))
+    norm = length(q)
     if not 0.5 < norm < 2:
         return None
     return AttitudeSample(0, (q if q[0] >= 0 else -q) / norm, _rates(message))

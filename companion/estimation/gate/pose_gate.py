@@ -29,7 +29,7 @@ from companion.estimation.gate.pose_rules import (
 from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.gate.proof import SILENT, Proof, seen_as_reckoned
 from companion.estimation.gate.reset_counter import ResetCounter
-from companion.geometry.transforms import Pose
+from companion.geometry.transforms import Pose, length
 from companion.messages import Odometry
 from companion.telemetry import AttitudeSample, is_believed
 
@@ -137,7 +137,7 @@ class PoseGate:
         """Add an attitude of the autopilot, for checks and predictions, where it is believed."""
         if not is_believed(sample, self._use):
             return
-        if not 0.5 < float(np.linalg.norm(sample.ned_from_body)) < 2.0:  # rejects nan too
+        if not 0.5 < length(sample.ned_from_body) < 2.0:  # rejects nan too
             return
         rates = sample.rates_body_rad_s
         if rates is not None and not np.isfinite(rates).all():
