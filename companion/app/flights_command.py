@@ -244,10 +244,8 @@ def _enough(going: Sequence[FlightPlace], needed: float) -> list[FlightPlace]:
 
 
 def _age_s(flight: FlightPlace, now_ns: int) -> float:
-    """Seconds since its date, or the latest date of a flight before it; 0 without a clock."""
-    if flight.not_before_s is None:
-        return 0.0
-    return now_ns * 1e-9 - flight.not_before_s
+    """Seconds since it began, at least; 0 where no clock tells."""
+    return 0.0 if flight.began_s is None else now_ns * 1e-9 - flight.began_s
 
 
 def _when(t_ns: int) -> str:

@@ -42,9 +42,9 @@ class FlightPlace(NamedTuple):
     """True while it is being recorded."""
     unarmed: bool = False
     """True as long as its motors were never armed."""
-    not_before_s: float | None = None
-    """Lower bound of its begin, Unix time, by its name and those before it in order; None where no
-    clock was ever right."""
+    began_s: float | None = None
+    """Its begin, Unix time, by its name and those before it in order. Of one whose clock was not
+    set, that of the next with a date, which it is not younger than; None where there is none."""
 
 
 def flights_in(folder: Path) -> list[FlightPlace]:
@@ -58,12 +58,8 @@ def flights_in(folder: Path) -> list[FlightPlace]:
         raise FlightError(f"{folder}: may not be read by this user; {hint}") from error
     except OSError as error:
         raise FlightError(f"{folder}: cannot be read: {error.strerror}") from error
-    out: list[FlightPlace] = []
-    newest_s: float | None = None
-    for name in names:
-        newest_s = max(filter(None, (newest_s, began_unix_s(name))), default=None)
-        out.append(_place(folder / name, newest_s))
-    return out
+    dates = _begins_s(names)
+    return [_place(folder / name, date) for name, date in zip(names, dates, strict=True)]
 
 
 def flown_in(folder: Path) -> list[FlightPlace]:
@@ -145,7 +141,20 @@ def is_recorded_now(flight: Path) -> bool:
     return any(map(_is_growing, recordings_in(flight)))
 
 
-def _place(path: Path, not_before_s: float | None) -> FlightPlace:
+def _begins_s(names: list[str]) -> list[float | None]:
+    """Begins of flights in order, as `FlightPlace.began_s`."""
+    newest_s = 0.0
+    dates: list[float | None] = []
+    for own_s in map(began_unix_s, names):
+        newest_s = max(newest_s, own_s or 0.0)
+        dates.append(None if own_s is None else newest_s)
+    next_s: float | None = None
+    for k in reversed(range(len(dates))):
+        next_s = dates[k] = next_s if dates[k] is None else dates[k]
+    return dates
+
+
+def _place(path: Path, began_s: float | None) -> FlightPlace:
     n_bytes = 0
     for folder, _, names in os.walk(path):
         for name in names:
@@ -155,7 +164,7 @@ def _place(path: Path, not_before_s: float | None) -> FlightPlace:
                 continue  # gone meanwhile
     return FlightPlace(
         path, n_bytes, (path / KEEP).exists(), is_recorded_now(path), (path / UNARMED).exists(),
-        not_before_s,
+        began_s,
     )  # fmt: skip
 
 

@@ -110,9 +110,24 @@ def test_a_clock_that_jumps_between_flights_changes_no_order(
     assert main([*prune, "--keep-newest", "3"]) == 0
     assert names(tmp_path) == flown[1:]
     assert [each.path.name for each in may_go(flights_in(tmp_path))] == flown[1:]  # for the daemon
-    days = max(0.0, time.time() - PRESENT_S) / 86400 + 400
-    assert main([*prune, "--older-than", str(days)]) == 0
+    days = max(0.0, time.time() - PRESENT_S) / 86400
+    assert main([*prune, "--older-than", str(days + 400)]) == 0
     assert names(tmp_path) == flown[1:]  # none of 1970 or 2000 is as old as its name
+
+
+def test_a_flight_of_unknown_date_is_no_older_than_the_next_that_has_one(tmp_path: Path) -> None:
+    days = max(0.0, time.time() - PRESENT_S) / 86400
+    flights = [
+        "00001-2026-08-01T00-00-00Z", "00002-1970-01-01T00-00-10Z", "00003-2026-11-22T04-00-00Z",
+        "00004-1970-01-01T00-00-10Z",
+    ]  # fmt: skip
+    for name in flights:
+        record(tmp_path / name, 3)
+    prune = ["flights", "prune", "--flights", str(tmp_path), "--older-than"]
+    assert main([*prune, str(days + 50)]) == 0
+    assert names(tmp_path) == flights[1:]
+    assert main([*prune, str(0.5 * days)]) == 0
+    assert names(tmp_path) == flights[3:], "nobody knows when the last was flown"
 
 
 def test_numbers_outlive_flights_and_the_counters_file(begun: Any, tmp_path: Path) -> None:
