@@ -16,7 +16,7 @@ from companion.estimation.georeference.tracked_places import Places
 from companion.estimation.georeference.trajectory_alignment import Scale
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_motion import InertialStart
-from companion.geometry.transforms import Array, nearest_rotation
+from companion.geometry.transforms import Array
 
 NOISES = tuple(0.5e-4 * 2.0**n for n in range(8))
 """White noise of a frame's place, units: 0.025 to 3.2 pixels of 500 at the typical distance of what
@@ -82,7 +82,10 @@ class InertialScale:
         if len(nodes) < self._least_nodes:
             return None
         places, sums = places.of(slice(nodes[0], None)), sums[nodes[0] :]
-        places = steadied(places, *integral.turns.at(places.t_ns + delay_ns), body_from_camera)
+        turns = integral.turns
+        places = steadied(
+            places, *turns.at(places.t_ns + delay_ns), body_from_camera, turns.density_rad_s
+        )
         nodes = nodes - nodes[0]
         near = near_nodes(places.t_ns, nodes, integral.density_m_s2)
         places, sums, nodes = places.of(near), sums[near], np.searchsorted(near, nodes)
@@ -90,7 +93,7 @@ class InertialScale:
         if start is not None and start.t_ns != places.t_ns[0]:
             start = None
         aligned = InertialAlignment(
-            places, sums, nodes, level_of(places), self._lever_camera_m,
+            places, sums, nodes, places.level, self._lever_camera_m,
             integral.density_m_s2, start,
         )  # fmt: skip
         if aligned.sustained_m_s2 > MOST_SUSTAINED_M_S2:
@@ -146,11 +149,6 @@ def near_nodes(
     before_ns = t_ns - t_ns[nodes[at - 1]]
     after_ns = np.abs(t_ns[nodes[np.minimum(at, len(nodes) - 1)]] - t_ns)
     return np.flatnonzero(np.minimum(before_ns, after_ns) <= within_ns)
-
-
-def level_of(places: Places) -> Array:
-    """Chordal mean of the rotations from map to NED, by attitude."""
-    return nearest_rotation((places.ned_from_camera @ places.rotations.transpose(0, 2, 1)).sum(0))
 
 
 def settled(

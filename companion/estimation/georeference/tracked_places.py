@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry.pose_table import PoseTable
-from companion.geometry.transforms import Array, Pose
+from companion.geometry.transforms import Array, Pose, nearest_rotation
 
 SPACING_NS = 45_000_000
 """Frames closer than this see the same features, with the same errors."""
@@ -39,6 +39,11 @@ class Places(NamedTuple):
             self.t_ns[chosen], self.rotations[chosen], self.places[chosen],
             self.ned_from_camera[chosen],
         )  # fmt: skip
+
+    @property
+    def level(self) -> Array:
+        """Chordal mean (3, 3) of the rotations from map to NED, by attitude."""
+        return nearest_rotation((self.ned_from_camera @ self.rotations.transpose(0, 2, 1)).sum(0))
 
 
 class TrackedPlaces:

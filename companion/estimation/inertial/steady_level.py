@@ -44,8 +44,6 @@ MAX_APART_RAD = float(np.radians(3.0))
 IMAGES_LAST_S = 15.0
 """Without images for longer, the bias is learnt from the autopilot's attitude, as before them."""
 BY_AUTOPILOT = -1
-NOISE_TAU = 500
-"""Samples over which the white noise is averaged."""
 WALK_M_S2, AUTOPILOT_WALK_M_S2 = 0.003, 0.03
 """Walk of the horizontal acceleration by a level, per root of a second: by gyroscopes, as their
 samples come, and by an autopilot's after each manoeuvre."""
@@ -66,10 +64,6 @@ class SteadyLevel:
         """Time and rates of the last sample."""
         self._rotation = np.eye(3)
         self._apart_rad = 0.0
-        self._change = np.zeros(3)
-        """Between the last two."""
-        self._variance = LEAST_DENSITY_RAD_S**2
-        """White noise of the rates, as a density."""
         self._bias = np.zeros(3)
         self._covariance = np.diag(np.r_[np.zeros(3), np.full(3, SIGMA_BIAS_RAD_S**2)])
         """Of the rotation that is expected of the next image, and of the bias."""
@@ -90,7 +84,7 @@ class SteadyLevel:
 
     @property
     def _noise(self) -> float:
-        return max(self._variance, LEAST_DENSITY_RAD_S**2)
+        return max(self._turns.density_rad_s, LEAST_DENSITY_RAD_S) ** 2
 
     @property
     def lead_hz(self) -> float:
@@ -122,7 +116,6 @@ class SteadyLevel:
             self._rotation, self._apart_rad = autopilot, 0.0
             return autopilot
         dt_s = regular_s((t_ns - last[0]) * 1e-9, self._turns.interval_s)
-        self._see_noise(rates - last[1], dt_s)
         mean = 0.5 * (last[1] + rates) - self._bias
         rotation = self._rotation @ rotation_from_vector(dt_s * mean)
         apart = autopilot @ rotation.T
@@ -141,13 +134,6 @@ class SteadyLevel:
         """Learn of the bias from the rotation (3, 3) of an image in its map."""
         self._images_ns = t_ns
         self._learn(t_ns, map_from_body, segment, SIGMA_IMAGES_RAD, IMAGES_S)
-
-    def _see_noise(self, change: Array, dt_s: float) -> None:
-        """White noise by second differences, in which motion hardly shows at 100 Hz."""
-        x, y, z = (change - self._change).tolist()
-        self._change = change
-        variance = (x * x + y * y + z * z) / 18.0 * dt_s
-        self._variance += (variance - self._variance) / NOISE_TAU
 
     def _learn(self, t_ns: int, seen: Array, source: int, sigma_rad: float, same_s: float) -> None:
         """Kalman filter of the rotation of a source, in its axes, and the bias."""

@@ -15,9 +15,9 @@ MAX_GAP_NS = 100_000_000
 MAX_SAMPLES = 32768
 """Nearly three minutes at 200 a second, 3 MB; the older half goes when they are full."""
 _IDENTITY = np.eye(3)
-INTERVAL_TAU, REGULAR = 500, 0.2
-"""Samples over which their interval is averaged, and by which ratio of it stamps of such that come
-regularly are off: an autopilot's scheduler, and corrections of the link's clock."""
+TAU, REGULAR = 500, 0.2
+"""Samples over which interval and noise are averaged; by which ratio of the interval stamps of
+samples that come regularly are off, by an autopilot's scheduler and corrections of the clock."""
 
 
 class TurnIntegral:
@@ -26,6 +26,8 @@ class TurnIntegral:
     def __init__(self) -> None:
         self.interval_s = 0.0
         """Of samples that come regularly."""
+        self._variance, self._change = 0.0, np.zeros(3)
+        """White noise of the rates, as a density; their change between the last two."""
         self._n = 0
         self._t_ns = np.zeros(MAX_SAMPLES, np.int64)
         self._rotations = np.zeros((MAX_SAMPLES, 3, 3))
@@ -54,16 +56,28 @@ class TurnIntegral:
                 self.interval_s = self.interval_s or dt_s
                 regular = regular_s(dt_s, self.interval_s)
                 if regular != dt_s:
-                    self.interval_s += (dt_s - self.interval_s) / INTERVAL_TAU
+                    self.interval_s += (dt_s - self.interval_s) / TAU
+                self._see_noise(rates - self._rates[last], regular)
                 turn = 0.5 * regular * (self._rates[last] + rates)
                 rotation = rotation @ rotation_from_vector(turn)
         self._t_ns[self._n], self._rotations[self._n] = sample.t_ns, rotation
         self._rates[self._n], self._gaps[self._n] = rates, gaps
         self._n += 1
 
+    @property
+    def density_rad_s(self) -> float:
+        """White noise of the gyroscopes, rad/s per root of Hz, from their own differences."""
+        return float(np.sqrt(self._variance))
+
     def withdraw(self, since_ns: int) -> None:
         """Drop what came from a time on: the samples were wrong."""
         self._n = int(np.searchsorted(self._t_ns[: self._n], since_ns))
+
+    def _see_noise(self, change: Array, dt_s: float) -> None:
+        """White noise by second differences, in which motion hardly shows at 100 Hz."""
+        x, y, z = (change - self._change).tolist()
+        self._change = change
+        self._variance += ((x * x + y * y + z * z) / 18.0 * dt_s - self._variance) / TAU
 
     def at(self, t_ns: NDArray[np.int64]) -> tuple[Array, Array, NDArray[np.int64]]:
         """Rotations (N, 3, 3) and rates (N, 3) at times (N,), and the number of gaps before each.
