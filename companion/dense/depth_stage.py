@@ -1,7 +1,7 @@
 """Depth stage: depth maps and points from keyframes and the frames around them.
 
 A keyframe waits for some later ones, so that poses are adjusted and views on both sides exist.
-Undistorted frames are buffered up to a bound.
+Frames are buffered up to a bound.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from companion.dense.fusion import Fusion, measured_only
 from companion.dense.undistortion import Undistortion
 from companion.dense.view_selection import MAX_VIEWS
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Pose, Similarity
+from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import (
     Bytes,
     DepthMap,
@@ -43,10 +43,13 @@ N_UPDATES = MAX_VIEWS + 1
 @dataclass(slots=True, eq=False)
 class _BufferedFrame:
     grey: Bytes
-    """Undistorted, of a rolling shutter only once its track has come."""
     rgb: Bytes | None
     """None once it is known that it is no keyframe."""
     track: Track | None = None
+    motion: Array | None = None
+    """During readout, as its first track has it."""
+    is_undistorted: bool = False
+    """`grey` is, once it is used, as most frames never are."""
 
 
 class DepthStage:
@@ -93,9 +96,8 @@ class DepthStage:
         elif isinstance(message, Track):
             buffered = self._frames.get(message.seq)
             if buffered is not None:
-                if self._undistortion.rolls and buffered.track is None:
-                    motion = message.shutter_motion
-                    buffered.grey = self._undistortion.image(buffered.grey, motion)
+                if buffered.track is None:
+                    buffered.motion = message.shutter_motion
                 buffered.track = message
         elif isinstance(message, KeyframeAdded):
             self._waiting.append(message)
@@ -122,10 +124,8 @@ class DepthStage:
         return out
 
     def _buffer(self, frame: Frame) -> None:
-        # of a rolling shutter once its track says how the camera moved
-        rolls = self._undistortion.rolls
-        grey = frame.grey if rolls else self._undistortion.image(frame.grey)
-        self._frames[frame.seq] = _BufferedFrame(grey, frame.rgb)
+        # a copy, as its memory is that of the colours, too, which are dropped before it
+        self._frames[frame.seq] = _BufferedFrame(frame.grey.copy(), frame.rgb)
         if len(self._frames) > MAX_FRAMES:
             # thin out the older half, except frames of pending keyframes
             needed = {k.seq for k in self._waiting}
@@ -154,9 +154,9 @@ class DepthStage:
         rgb = self._undistortion.image(buffered.rgb, motion)
 
         def depth(engine: DepthEngine) -> DepthMap:
-            engine.begin(buffered.grey, near, far)
+            engine.begin(self._undistorted(buffered), near, far)
             for seq, current_from_reference in chosen:
-                engine.update(self._frames[seq].grey, current_from_reference)
+                engine.update(self._undistorted(self._frames[seq]), current_from_reference)
             return engine.finish(keyframe.keyframe_id, keyframe.t_ns, rgb)
 
         found = self._engine.run(keyframe.t_ns, depth)
@@ -166,6 +166,12 @@ class DepthStage:
         depth_map = measured_only(found)
         chunks: list[PointChunk] = self._fusion.add(depth_map, update)
         return [depth_map, *chunks]
+
+    def _undistorted(self, buffered: _BufferedFrame) -> Bytes:
+        if not buffered.is_undistorted:
+            buffered.grey = self._undistortion.image(buffered.grey, buffered.motion)
+            buffered.is_undistorted = True
+        return buffered.grey
 
     def _scheduled(self) -> bool:
         """Count a keyframe; True if it is due at the present load ratio."""

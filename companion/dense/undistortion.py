@@ -37,11 +37,6 @@ class Undistortion:
             rays = (grid - [k.cx, k.cy]) / [k.fx, k.fy]
             self._unrolling = Unrolling(camera, 1e-3 * camera.readout_ms, rays, self._maps())
 
-    @property
-    def rolls(self) -> bool:
-        """True if the camera has a rolling shutter, which is undone by `image`."""
-        return self._unrolling is not None
-
     def image(self, image: Bytes, motion: Array | None = None) -> Bytes:
         """The undistorted image, (H, W) or (H, W, 3).
 
