@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,6 +60,7 @@ class Reconstruction:
             device, camera.width, camera.height, self._undistortion.intrinsics, config.depth
         )
         self._kept: dict[int, Bytes] = {}
+        self.log: list[ReferenceLog] = []
 
     def picture(self, position: int) -> Bytes:
         """Undistorted RGB image (H, W, 3) at a position."""
@@ -94,10 +95,21 @@ class Reconstruction:
         others = ((self.grey(p), self.pose(p).inverse() @ self.pose(reference)) for p in chosen)
         return depth_range(self.grey(reference), others, self._undistortion.intrinsics)
 
-    def depth_map(
+    def of_reference(
+        self, reference: int, positions: list[int], range_m: tuple[float, float], reach_m: float
+    ) -> DepthMap:
+        """Depth map of a reference from those images that are near it; adds to the log."""
+        others = _others(self.images, positions, reference, reach_m)
+        self.load([reference, *others])
+        found, updates, spent = self._depth_map(reference, others, *range_m)
+        number, n_searched = self.images.numbers[reference], self.engine.n_searched
+        self.log.append(ReferenceLog(number, range_m, n_searched, tuple(updates), spent))
+        return found
+
+    def _depth_map(
         self, reference: int, others: list[int], near_m: float, far_m: float
     ) -> tuple[DepthMap, list[UpdateLog], Spent]:
-        """Depth map of one reference from images in this order; log of each update; total time."""
+        """Depth map from images in this order; log of each update; total time."""
         engine, begun_ms = self.engine, self._wall_ms()
         with self.times("begin"):
             engine.begin(self.grey(reference), near_m, far_m)
@@ -165,7 +177,6 @@ def reconstruct(
     n_written = 0
     chunks: list[PointChunk] = []
     done: list[DepthMap] = []
-    log = []
     numbers = images.numbers
     places = {numbers[p]: pose for p in positions if (pose := images.poses[p]) is not None}
     update = MapUpdate(0, 0, places, np.zeros((0, 3)), None)
@@ -175,38 +186,36 @@ def reconstruct(
             if wanted.range_m is None and n > 1:
                 range_m = work.found_range(reference, positions) or range_m
             reach_m = np.inf if single else MAX_BASELINE * math.sqrt(range_m[0] * range_m[1])
-            others = _others(images, positions, reference, reach_m)
-            work.load([reference, *others])
-            depth_map, updates, spent = work.depth_map(reference, others, *range_m)
+            depth_map = work.of_reference(reference, positions, range_m, reach_m)
             if alone is not None:
                 alone(depth_map)
-            done += [depth_map] if single else consensus.add(depth_map, work.pose(reference))
-            log.append(
-                ReferenceLog(
-                    numbers[reference], range_m, work.engine.n_searched, tuple(updates), spent
-                )
-            )
-            if not single:
+            if single:
+                done.append(depth_map)
+            else:
+                done += consensus.add(depth_map, work.pose(reference))
                 chunks += fusion.add(depth_map, update)
-            if out is not None:
-                for it in done[n_written:]:
-                    write_depth(out, it)
+            _write(out, done[n_written:])
             n_written = len(done)
             progress.update(n, f"frame {numbers[reference]}", sum(len(c.rgb) for c in chunks))
     finally:
         progress.finish()
     done += consensus.flush()
+    _write(out, done[n_written:])
     if out is None:
         return done
-    for it in done[n_written:]:
-        write_depth(out, it)
     chunks += [chunk_alone(done[0])] if single else fusion.flush(update)
     write_cloud(out, chunks, places)
     write_log(
-        out, device=device.described, layout=images.layout, maps=done, log=log,
-        stages=work.times.summary(),
+        out, device=device.described, layout=images.layout, maps=done,
+        log=work.log, stages=work.times.summary(),
     )  # fmt: skip
     return done
+
+
+def _write(out: Path | None, maps: Sequence[DepthMap]) -> None:
+    if out is not None:
+        for each in maps:
+            write_depth(out, each)
 
 
 def _positions(images: PosedImages, frames: tuple[int | None, int | None]) -> list[int]:
