@@ -31,6 +31,7 @@ class Distortion(Enum):
     """Kannala-Brandt fisheye, coefficients k1 k2 k3 k4."""
 
 
+LENS = ("width", "height", "fx", "fy", "cx", "cy")
 COEFFICIENTS: dict[Distortion, tuple[str, ...]] = {
     Distortion.NONE: (),
     Distortion.RADTAN: ("k1", "k2", "p1", "p2", "k3"),
@@ -64,6 +65,11 @@ class Camera:
     where unknown."""
     gimbal: Gimbal | None = None
     """None of a camera that is fixed to the body."""
+
+    @property
+    def lens(self) -> dict[str, float]:
+        """Size, focal lengths and centre by name, as documents have them."""
+        return {name: getattr(self, name) for name in LENS}
 
     @property
     def focal_px(self) -> float:

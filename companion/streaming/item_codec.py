@@ -27,7 +27,7 @@ from enum import IntEnum
 import numpy as np
 
 from companion.errors import StreamError
-from companion.geometry.camera import Camera
+from companion.geometry.camera import LENS, Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import (
     Pose,
@@ -87,8 +87,6 @@ MOST_JSON_BYTES = 65536
 NOWHERE_UNITS = 1e-6
 """Scale that marks a keyframe without a known pose."""
 WORLD = -1
-LENS = ("width", "height", "fx", "fy", "cx", "cy")
-"""Camera fields that a viewer needs."""
 
 
 def encode(item: Item) -> bytes:
@@ -211,7 +209,7 @@ def _flight(item: FlightItem) -> bytes:
     document = {
         "flight_id": item.flight_id,
         "name": item.name,
-        "camera": {name: getattr(item.camera, name) for name in LENS},
+        "camera": item.camera.lens,
         "origin": asdict(item.origin) if item.origin is not None else None,
     }
     return json.dumps(document).encode()

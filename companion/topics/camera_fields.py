@@ -19,9 +19,8 @@ def camera_fields(camera: Camera) -> dict[str, Any]:
     """Fields of the JSON object `camera`."""
     body = camera.body_from_camera
     return {
-        "width": camera.width, "height": camera.height,
-        "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
-        "distortion": camera.distortion.value, "coefficients": list(camera.coefficients),
+        **camera.lens, "distortion": camera.distortion.value,
+        "coefficients": list(camera.coefficients),
         "body_from_camera": pose_row(body) if body is not None else None,
         "assumed": camera.assumed, "readout_ms": camera.readout_ms,
     }  # fmt: skip

@@ -15,9 +15,7 @@ from companion.geometry.transforms import Pose
 def camera_document(camera: Camera) -> bytes:
     """JSON of a camera; numbers are read back unchanged."""
     document: dict[str, Any] = {
-        "width": camera.width, "height": camera.height,
-        "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
-        "distortion_model": camera.distortion.value,
+        **camera.lens, "distortion_model": camera.distortion.value,
         "D": [float(each) for each in camera.coefficients],
         "assumed": camera.assumed,
     }  # fmt: skip

@@ -104,13 +104,7 @@ class LiveSamples:
         if t_ns is None:
             self.n_dropped["telemetry before the clock was known"] += 1
             return
-        latest_ns = self._latest.get("GimbalSample", (-1, -1))[1]
-        if t_ns <= latest_ns:
-            self._drop(OUT_OF_ORDER, receive_ns, name)
-        elif t_ns > receive_ns + max(AHEAD_NS, 5 * self._clock.sigma_ns):
-            self._drop(AHEAD, receive_ns, f"{name} by {(t_ns - receive_ns) * 1e-9:.2f} s")
-        else:
-            self._latest["GimbalSample"] = -1, t_ns
+        if self._is_in_order(_quantity(sample), t_ns, t_ns, receive_ns, name):
             self._deliver(dataclasses.replace(sample, t_ns=t_ns))
 
     def _take(self, kind: int, message: Any, receive_ns: int) -> None:
@@ -146,22 +140,29 @@ class LiveSamples:
         if t_ns is None:
             self.n_dropped["telemetry before the clock was known"] += 1
             return
-        quantity = _quantity(content)
-        latest_ns, latest_t_ns = self._latest.get(quantity, (-1, -1))
-        if remote_ns <= latest_ns or t_ns <= latest_t_ns:
-            self._drop(OUT_OF_ORDER, receive_ns, name)
-            return
-        if t_ns > receive_ns + max(AHEAD_NS, 5 * self._clock.sigma_ns):
-            self._drop(AHEAD, receive_ns, f"{name} by {(t_ns - receive_ns) * 1e-9:.2f} s")
+        if not self._is_in_order(_quantity(content), remote_ns, t_ns, receive_ns, name):
             return
         if receive_ns - t_ns > LATE_NS:
             self._warn_once(LATE, receive_ns, f"{name} by {(receive_ns - t_ns) * 1e-9:.1f} s")
-        self._latest[quantity] = remote_ns, t_ns
         sample = self._placed(content, remote_ns)
         if sample is None:
             self.n_dropped["positions without an origin"] += 1
             return
         self._deliver(dataclasses.replace(sample, t_ns=t_ns))
+
+    def _is_in_order(
+        self, quantity: str, remote_ns: int, t_ns: int, receive_ns: int, name: str
+    ) -> bool:
+        """True of a sample that is later than the one before, and not of the future."""
+        latest_ns, latest_t_ns = self._latest.get(quantity, (-1, -1))
+        if remote_ns <= latest_ns or t_ns <= latest_t_ns:
+            self._drop(OUT_OF_ORDER, receive_ns, name)
+        elif t_ns > receive_ns + max(AHEAD_NS, 5 * self._clock.sigma_ns):
+            self._drop(AHEAD, receive_ns, f"{name} by {(t_ns - receive_ns) * 1e-9:.2f} s")
+        else:
+            self._latest[quantity] = remote_ns, t_ns
+            return True
+        return False
 
     def _placed(self, content: Telemetry | GeodeticFix, remote_ns: int) -> Telemetry | None:
         if isinstance(content, GeodeticFix):

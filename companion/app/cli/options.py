@@ -122,41 +122,25 @@ def seconds(text: str) -> float:
     return value
 
 
-def number(text: str) -> int:
-    """A whole number, 0 or more."""
-    value = int(text) if text.isascii() and text.isdigit() else -1
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"wanted a number from 0 on, given is {text}")
-    return value
+def at_least(low: int) -> Callable[[str], int]:
+    """Parser of whole numbers from `low` on."""
 
-
-def count(text: str) -> int:
-    """A whole number, 1 or more."""
-    value = int(text) if text.isascii() and text.isdigit() else 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"wanted a number from 1 on, given is {text}")
-    return value
-
-
-def within(low: float, high: float) -> Callable[[str], float]:
-    """Parser of numbers from `low` to `high`."""
-
-    def parsed(text: str) -> float:
-        value = float(text)
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"wanted {low:g} to {high:g}, given is {text}")
+    def parsed(text: str) -> int:
+        value = int(text) if text.isascii() and text.isdigit() else low - 1
+        if value < low:
+            raise argparse.ArgumentTypeError(f"wanted a number from {low} on, given is {text}")
         return value
 
     return parsed
 
 
-def whole_within(low: int, high: int) -> Callable[[str], int]:
-    """Parser of whole numbers from `low` to `high`."""
+def within(low: float, high: float, kind: type[float] = float) -> Callable[[str], float]:
+    """Parser of numbers from `low` to `high`; of `kind` int of whole ones."""
 
-    def parsed(text: str) -> int:
-        value = int(text)
+    def parsed(text: str) -> float:
+        value = kind(text)
         if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"wanted {low} to {high}, given is {text}")
+            raise argparse.ArgumentTypeError(f"wanted {low:g} to {high:g}, given is {text}")
         return value
 
     return parsed

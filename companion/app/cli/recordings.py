@@ -10,14 +10,13 @@ from typing import Any
 
 from companion.app.cli.options import (
     amount,
+    at_least,
     check_span,
     command,
     configuration,
-    count,
     held_folder,
     json_option,
     made_folder,
-    number,
     seconds,
 )
 from companion.app.progress import Progress, progress_on
@@ -189,7 +188,7 @@ def _add_batch(commands: Any) -> None:
         help="make one site map of all, DIR/site.map, and more where they show no common place",
     )  # fmt: skip
     batch.add_argument(
-        "--workers", type=count, metavar="N",
+        "--workers", type=at_least(1), metavar="N",
         help="replays at a time, each in a process (default: one per core)",
     )  # fmt: skip
     batch.add_argument(
@@ -269,7 +268,7 @@ def _add_upkeep(does: Any, place: argparse.ArgumentParser) -> None:
         description="Delete finished flights with all their results, the oldest first. One with a "
         'file named "keep" in its folder stays. Of several conditions all must hold.',
     )  # fmt: skip
-    prune.add_argument("--keep-newest", type=number, metavar="N", help="all but the newest N")
+    prune.add_argument("--keep-newest", type=at_least(0), metavar="N", help="all but the newest N")
     prune.add_argument("--older-than", type=amount, metavar="DAYS", help="older than so many days")
     prune.add_argument(
         "--free", type=amount, metavar="MB", help="only until so many megabytes are free"

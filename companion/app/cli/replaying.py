@@ -18,7 +18,6 @@ from companion.app.cli.options import (
     seconds,
     shift,
     viewer,
-    whole_within,
     within,
 )
 from companion.app.progress import JsonProgress, progress_on
@@ -274,10 +273,10 @@ def _add_film(commands: Any) -> None:
         help="its length in seconds (default: 30)",
     )  # fmt: skip
     film.add_argument(
-        "--height", type=whole_within(120, 2160), default=720, metavar="PX",
+        "--height", type=within(120, 2160, int), default=720, metavar="PX",
         help="its height in pixels (default: 720)",
     )  # fmt: skip
     film.add_argument(
-        "--rate", type=whole_within(1, 60), default=25, metavar="HZ",
+        "--rate", type=within(1, 60, int), default=25, metavar="HZ",
         help="frames a second (default: 25)",
     )  # fmt: skip

@@ -105,31 +105,33 @@ class MountEstimator:
 
         None with too few.
         """
-        samples = list(self._samples)
-        pairs = _pairs(len(samples))
+        turns = self._turns(_pairs(len(self._samples)))
+        if turns is None:
+            return None
+        return vectors_from_rotations(turns[0]), vectors_from_rotations(turns[1])
+
+    def _turns(self, pairs: NDArray[np.int64]) -> tuple[Array, Array] | None:
+        """Rotations (N, 3, 3) of the camera and of the body over these pairs; None with too few."""
         if len(pairs) < MIN_PAIRS:
             return None
         i, j = pairs.T
-        camera = np.stack([s.map_from_camera for s in samples])
-        body = np.stack([s.ned_from_body for s in samples])
+        camera = np.stack([s.map_from_camera for s in self._samples])
+        body = np.stack([s.ned_from_body for s in self._samples])
         return (
-            vectors_from_rotations(np.matmul(camera[i].transpose(0, 2, 1), camera[j])),
-            vectors_from_rotations(np.matmul(body[i].transpose(0, 2, 1), body[j])),
+            np.matmul(camera[i].transpose(0, 2, 1), camera[j]),
+            np.matmul(body[i].transpose(0, 2, 1), body[j]),
         )
 
     def estimate(self) -> MountEstimate | None:
         """Mount and offset from all pairs; None with too few."""
         samples = list(self._samples)
         pairs = _pairs(len(samples))
-        if len(pairs) < MIN_PAIRS:
+        turns = self._turns(pairs)
+        if turns is None:
             return None
-        i, j = pairs.T
+        (i, j), (camera_rotation, body_rotation) = pairs.T, turns
         t_s = np.array([s.t_ns - samples[0].t_ns for s in samples]) * 1e-9
-        camera = np.stack([s.map_from_camera for s in samples])
-        body = np.stack([s.ned_from_body for s in samples])
         rate = np.stack([s.rate_body_rad_s for s in samples])
-        camera_rotation = np.matmul(camera[i].transpose(0, 2, 1), camera[j])
-        body_rotation = np.matmul(body[i].transpose(0, 2, 1), body[j])
         sigma = np.hypot(SIGMA_RAD, SIGMA_DRIFT_RAD_S * (t_s[j] - t_s[i]))
         rotvec, offset_s = np.zeros(3), 0.0
         information, error, chi2 = np.eye(4), np.zeros((len(i), 3)), 1.0

@@ -60,20 +60,21 @@ class MeasuredPath:
 
     def displacement_between(self, from_ns: int, to_ns: int) -> Array | None:
         """Measured displacement (3,), NED metres, between two times; None where unknown."""
-        for source in self.sources:
-            if len(self.positions[source]) >= 4:
-                where, ok = self.positions[source].at(np.array([from_ns, to_ns]))
-                if ok.all():
-                    return np.asarray(where[1] - where[0], np.float64)
-        return None
+        where = self._places_at(from_ns, to_ns)
+        return None if where is None else np.asarray(where[1] - where[0], np.float64)
 
     def place_at(self, t_ns: int) -> Array | None:
         """Measured place (3,) of the body, NED metres; None where unknown."""
+        where = self._places_at(t_ns)
+        return None if where is None else np.asarray(where[0], np.float64)
+
+    def _places_at(self, *times_ns: int) -> Array | None:
+        """Places (N, 3) by one source, NED metres; None where none has all of them."""
         for source in self.sources:
             if len(self.positions[source]) >= 4:
-                where, ok = self.positions[source].at(np.array([t_ns]))
+                where, ok = self.positions[source].at(np.array(times_ns))
                 if ok.all():
-                    return np.asarray(where[0], np.float64)
+                    return where
         return None
 
     def integrated_velocity(self, t_ns: Array) -> Array | None:

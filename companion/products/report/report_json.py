@@ -135,12 +135,7 @@ def _clock(facts: RunFacts) -> dict[str, Any] | None:
 def _camera(facts: RunFacts) -> dict[str, Any]:
     camera = facts.camera
     return {
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
+        **camera.lens,
         "distortion": camera.distortion.value,
         "coefficients": list(camera.coefficients),
         "assumed": camera.assumed,
