@@ -76,7 +76,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "run" / "status.sock"
 
 
-def test_each_connection_gets_the_document_of_its_moment(path: Path) -> None:
+async def test_each_connection_gets_the_document_of_its_moment(path: Path) -> None:
     n = 0
 
     def document() -> dict[str, Any]:
@@ -84,25 +84,19 @@ def test_each_connection_gets_the_document_of_its_moment(path: Path) -> None:
         n += 1
         return {"n": n}
 
-    async def test() -> None:
-        async with served(path, document):
-            assert [await ask(path) for _ in range(3)] == [{"n": 1}, {"n": 2}, {"n": 3}]
-        assert not path.exists()
-
-    run(test)
+    async with served(path, document):
+        assert [await ask(path) for _ in range(3)] == [{"n": 1}, {"n": 2}, {"n": 3}]
+    assert not path.exists()
 
 
-def test_only_owner_and_group_reach_it(path: Path) -> None:
-    async def test() -> None:
-        async with served(path):
-            assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
-            assert stat.S_IMODE(path.stat().st_mode) == 0o660
-
-    run(test)
+async def test_only_owner_and_group_reach_it(path: Path) -> None:
+    async with served(path):
+        assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+        assert stat.S_IMODE(path.stat().st_mode) == 0o660
 
 
 @pytest.mark.real_time
-def test_clients_that_never_read_or_never_leave_do_no_harm(
+async def test_clients_that_never_read_or_never_leave_do_no_harm(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """More than the kernel buffers, so that a client which does not read holds its place."""
@@ -115,53 +109,43 @@ def test_clients_that_never_read_or_never_leave_do_no_harm(
         except SourceError:
             return False
 
-    async def test() -> None:
-        async with served(path, lambda: big):
-            stuck = []
-            for _ in range(short_answers.MAX_CLIENTS):
-                client = socket.socket(socket.AF_UNIX)
+    async with served(path, lambda: big):
+        stuck = []
+        for _ in range(short_answers.MAX_CLIENTS):
+            client = socket.socket(socket.AF_UNIX)
+            client.connect(str(path))
+            stuck.append(client)
+        while await is_answered():  # until no place is free
+            await asyncio.sleep(0.01)
+        while not await is_answered():
+            await asyncio.sleep(0.1)
+        for client in stuck:
+            client.close()
+
+
+async def test_a_client_that_sends_garbage_or_leaves_does_no_harm(path: Path) -> None:
+    async with served(path) as warned:
+        for garbage in (b"", b"\0" * 100_000, b"GET / HTTP/1.0\r\n\r\n"):
+            with socket.socket(socket.AF_UNIX) as client:
                 client.connect(str(path))
-                stuck.append(client)
-            while await is_answered():  # until no place is free
-                await asyncio.sleep(0.01)
-            while not await is_answered():
-                await asyncio.sleep(0.1)
-            for client in stuck:
-                client.close()
-
-    run(test)
+                client.setblocking(False)
+                with contextlib.suppress(OSError):
+                    client.send(garbage)
+            await asyncio.sleep(0.01)
+        assert (await ask(path))["tracker"] == "tracking"
+        assert warned == []
 
 
-def test_a_client_that_sends_garbage_or_leaves_does_no_harm(path: Path) -> None:
-    async def test() -> None:
-        async with served(path) as warned:
-            for garbage in (b"", b"\0" * 100_000, b"GET / HTTP/1.0\r\n\r\n"):
-                with socket.socket(socket.AF_UNIX) as client:
-                    client.connect(str(path))
-                    client.setblocking(False)
-                    with contextlib.suppress(OSError):
-                        client.send(garbage)
-                await asyncio.sleep(0.01)
-            assert (await ask(path))["tracker"] == "tracking"
-            assert warned == []
-
-    run(test)
-
-
-def test_a_fault_in_the_document_is_told_and_survived(
+async def test_a_fault_in_the_document_is_told_and_survived(
     path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     documents: Iterator[dict[str, Any]] = iter([{"bad": float("nan")}, {"good": 1}])
-
-    async def test() -> None:
-        async with served(path, lambda: next(documents)) as warned:
-            with pytest.raises(SourceError, match="incomplete"):
-                await ask(path)
-            assert len(warned) == 1
-            assert capfd.readouterr().err.count("Traceback") == 1
-            assert await ask(path) == {"good": 1}
-
-    run(test)
+    async with served(path, lambda: next(documents)) as warned:
+        with pytest.raises(SourceError, match="incomplete"):
+            await ask(path)
+        assert len(warned) == 1
+        assert capfd.readouterr().err.count("Traceback") == 1
+        assert await ask(path) == {"good": 1}
 
 
 KILLED = """
@@ -221,23 +205,20 @@ def test_what_is_no_socket_is_left_alone(path: Path) -> None:
     assert path.read_text() == "precious"
 
 
-def test_places_that_cannot_be_are_named(tmp_path: Path) -> None:
-    async def test() -> None:
-        with pytest.raises(ConfigError, match="longer than 107 bytes"):
-            async with served(tmp_path / ("x" * 108)):
-                pass
-        (tmp_path / "file").write_text("")
-        with pytest.raises(ConfigError, match=r"expert\.daemon\.socket: .*/file/status\.sock"):
-            async with served(tmp_path / "file" / "status.sock"):
-                pass
-        open_to_all = tmp_path / "open"
-        open_to_all.mkdir()
-        open_to_all.chmod(0o777)
-        with pytest.raises(ConfigError, match="anyone may write there"):
-            async with served(open_to_all / "status.sock"):
-                pass
-
-    run(test)
+async def test_places_that_cannot_be_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="longer than 107 bytes"):
+        async with served(tmp_path / ("x" * 108)):
+            pass
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"expert\.daemon\.socket: .*/file/status\.sock"):
+        async with served(tmp_path / "file" / "status.sock"):
+            pass
+    open_to_all = tmp_path / "open"
+    open_to_all.mkdir()
+    open_to_all.chmod(0o777)
+    with pytest.raises(ConfigError, match="anyone may write there"):
+        async with served(open_to_all / "status.sock"):
+            pass
 
 
 def test_the_place_is_found_as_it_is_chosen(tmp_path: Path) -> None:
@@ -297,7 +278,7 @@ def test_table_of_a_daemon_of_another_version_is_shown_all_the_same() -> None:
     assert "camera" in status_table({"sources": [{"name": "camera"}], "new": 1})
 
 
-def test_status_prints_json_or_a_table(path: Path) -> None:
+async def test_status_prints_json_or_a_table(path: Path) -> None:
     async def shown(as_json: bool) -> str:
         out = io.StringIO()
         await asyncio.to_thread(
@@ -305,12 +286,9 @@ def test_status_prints_json_or_a_table(path: Path) -> None:
         )
         return out.getvalue()
 
-    async def test() -> None:
-        async with served(path):
-            assert '"tracker": "tracking"' in await shown(True)
-            assert (await shown(False)).startswith("pose")
-
-    run(test)
+    async with served(path):
+        assert '"tracker": "tracking"' in await shown(True)
+        assert (await shown(False)).startswith("pose")
 
 
 def test_watching_ends_when_the_daemon_does(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
