@@ -124,8 +124,10 @@ def _feedback(feedback: Mapping[str, Any]) -> str:
         detail = feedback.get("detail")
         why = f"held back: {feedback.get('why_not') or 'not yet'}"
         return why + (f" ({detail})" if detail else "")
+    by = " by dead reckoning" if feedback.get("bridging") else ""
     return (
-        f"{feedback['mode']}, {_number(feedback.get('rate_hz'), '/s')}, {_after_exposure(feedback)}"
+        f"{feedback['mode']}{by}, {_number(feedback.get('rate_hz'), '/s')},"
+        f" {_after_exposure(feedback)}"
         f" ({_number(feedback.get('latency_p95_ms'), ' ms')} p95),"
         f" {feedback.get('n_resets', 0)} resets"
     )

@@ -266,6 +266,14 @@ def test_table_says_what_is_believed_where_it_is_not_everything(
     assert [line for line in lines if "believed" in line] == ([row] if row else [])
 
 
+def test_table_says_that_poses_go_by_dead_reckoning() -> None:
+    sending = FeedbackHealth("odometry", True, rate_hz=30.0, bridging=True)
+    lines = status_table(replace(HEALTH, feedback=sending).to_json()).splitlines()
+    assert any(line.startswith("feedback    odometry by dead reckoning, 30/s") for line in lines)
+    plain = replace(HEALTH, feedback=replace(sending, bridging=False))
+    assert "dead reckoning" not in status_table(plain.to_json())
+
+
 def test_table_says_what_did_not_fit_the_motion_by_kind() -> None:
     refused = replace(HEALTH, refused={"place": 3, "flow": 12})
     lines = status_table(refused.to_json()).splitlines()
