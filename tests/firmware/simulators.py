@@ -44,6 +44,9 @@ class Simulator:
     """Where the vehicle stands at first."""
     stands_m = 0.0
     """From the ground up to where its simulator says that it is while it stands."""
+    without_gps: Mapping[str, float] = {}
+    on_our_pose: Mapping[str, float] = {}
+    """Parameters with which it flies on our pose: what docs/autopilots.md asks for."""
 
     def __init__(
         self, binary: Path, folder: Path, ports: Ports, parameters: Mapping[str, float]
@@ -112,6 +115,11 @@ class ArduCopter(Simulator):
     name = "ArduCopter"
     home = GeoOrigin(-35.363262, 149.165237, 584.0)
     stands_m = 0.09
+    without_gps: Mapping[str, float] = {"GPS1_TYPE": 0, "SIM_GPS1_ENABLE": 0}
+    on_our_pose: Mapping[str, float] = {
+        "VISO_TYPE": 1, "EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6, "EK3_SRC1_VELZ": 6,
+        "EK3_SRC1_POSZ": 1, "EK3_SRC1_YAW": 1, "VISO_DELAY_MS": 62,
+    }  # fmt: skip
 
     def _command(self) -> list[str]:
         defaults = self.folder / "defaults.parm"
@@ -141,6 +149,13 @@ class Px4(Simulator):
 
     name = "PX4"
     home = GeoOrigin(47.397742, 8.545594, 489.4)
+    without_gps: Mapping[str, float] = {
+        "SENS_EN_GPSSIM": 0, "SYS_HAS_GPS": 0, "EKF2_GPS_CTRL": 0
+    }  # fmt: skip
+    on_our_pose: Mapping[str, float] = {
+        "EKF2_EV_CTRL": 7, "EKF2_HGT_REF": 0, "EKF2_EV_DELAY": 0, "EKF2_EV_NOISE_MD": 0,
+        "EKF2_EVP_NOISE": 0.05, "EKF2_EVV_NOISE": 0.05, "COM_ARM_WO_GPS": 1,
+    }  # fmt: skip
     FIXED = (14550, 14540)
     _has_parameters = False
 

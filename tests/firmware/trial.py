@@ -48,21 +48,6 @@ N_FEATURES = 720
 OWN_TO_EACH = "camera.", "mount.", "link."
 RESTART_S = 2.0
 """RestartSec of the service."""
-WITHOUT_GPS: dict[str, dict[str, float]] = {
-    "ArduCopter": {"GPS1_TYPE": 0, "SIM_GPS1_ENABLE": 0},
-    "PX4": {"SENS_EN_GPSSIM": 0, "SYS_HAS_GPS": 0, "EKF2_GPS_CTRL": 0},
-}
-ON_OUR_POSE: dict[str, dict[str, float]] = {
-    "ArduCopter": {
-        "VISO_TYPE": 1, "EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6, "EK3_SRC1_VELZ": 6,
-        "EK3_SRC1_POSZ": 1, "EK3_SRC1_YAW": 1, "VISO_DELAY_MS": 62,
-    },
-    "PX4": {
-        "EKF2_EV_CTRL": 7, "EKF2_HGT_REF": 0, "EKF2_EV_DELAY": 0, "EKF2_EV_NOISE_MD": 0,
-        "EKF2_EVP_NOISE": 0.05, "EKF2_EVV_NOISE": 0.05, "COM_ARM_WO_GPS": 1,
-    },
-}  # fmt: skip
-"""What docs/autopilots.md asks for."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +93,7 @@ class Trial:
         kind = Px4 if firmware.name == "px4" else ArduCopter
         ground, cable = kind.FIXED if kind is Px4 else (free_port(), free_port())
         self._companion_port, self._camera_port = free_port(), free_port()
-        self._second_port = free_port()
+        self._second_port, self._video_port = free_port(), free_port()
         self._line = tuple(self.folder / f"{end}.tty" for end in ("autopilot", "companion"))
         line = f"{self._line[0]}:{conditions.baud}" if conditions.baud else ""
         ports = Ports(ground, line or cable, self._camera_port)
@@ -120,7 +105,6 @@ class Trial:
         self.status: dict[str, Any] = {}
         self.events: list[tuple[float, str]] = []
         self.began_s = time.time()
-        self._video_port = free_port()
         self._over = threading.Event()
         self._open = ExitStack()
 
@@ -141,9 +125,9 @@ class Trial:
                 "COM_RC_IN_MODE": 1, "NAV_DLL_ACT": 0, "COM_DL_LOSS_T": 60,
             }  # fmt: skip
         if not c.has_gps:
-            own |= WITHOUT_GPS[kind.name]
+            own |= kind.without_gps
         if not c.by_doctor:
-            own |= ON_OUR_POSE[kind.name]
+            own |= kind.on_our_pose
         return own | dict(c.parameters)
 
     def __enter__(self) -> Trial:

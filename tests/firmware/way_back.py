@@ -18,7 +18,7 @@ from tests.firmware import manoeuvres
 from tests.firmware.features import OWN_SOURCES, up_by_gps
 from tests.firmware.figures import Figures, percentile
 from tests.firmware.missions import fetched, uploaded
-from tests.firmware.trial import ON_OUR_POSE, WITHOUT_GPS, Conditions, Trial
+from tests.firmware.trial import Conditions, Trial
 
 WAY_M = ((12.0, 0.0), (12.0, 8.0))
 FLOWN_S, LOCATED_S = 60.0, 30.0
@@ -93,7 +93,7 @@ def _is_located(trial: Trial) -> bool:
 def _restart_without_gps(trial: Trial) -> None:
     """Off and on again, as in a shed: no receiver, our pose in the first source set."""
     firmware = trial.firmware
-    firmware.parameters |= WITHOUT_GPS[firmware.name] | ON_OUR_POSE[firmware.name]
+    firmware.parameters |= {**firmware.without_gps, **firmware.on_our_pose}
     firmware.restart()
     trial.mark("autopilot restarted, without GPS")
     time.sleep(manoeuvres.SETTLE_S)
