@@ -108,3 +108,5 @@ def loopback_only(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 os.environ.setdefault("MPLBACKEND", "agg")
+# with it each process that a test begins compiles the whole program anew: seconds each
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
