@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.camera_motion import CameraMotion
+from companion.estimation.inertial.steady_level import SteadyLevel
 from companion.estimation.lens.lens_watch import LensWatch
 from companion.estimation.odometry.tracking_margin import TrackingMargin
 from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
@@ -20,12 +21,12 @@ class CameraWatch:
 
     def __init__(
         self, camera: Camera, n_features: int, tracker: Tracker, attitude: CameraAttitude,
-        motion: CameraMotion, times: Timer,
+        motion: CameraMotion, level: SteadyLevel, times: Timer,
     ) -> None:  # fmt: skip
         self._tracker, self._attitude = tracker, attitude
         self._motion, self._times = motion, times
         self._shutter = None if camera.readout_ms == 0 else ShutterOfFrames(camera)
-        self._lens = None if camera.gimbal is not None else LensWatch(camera)
+        self._lens = None if camera.gimbal is not None else LensWatch(camera, level)
         self._margin = TrackingMargin(camera, n_features)
 
     @property
@@ -63,5 +64,8 @@ class CameraWatch:
             yield from said
         if self._lens is not None and self._lens.watches:
             with self._times("lens"):
-                said = self._lens.end(view_of(seq), slam_map, self._attitude.correction[0])
+                said = self._lens.end(
+                    view_of(seq), slam_map, self._attitude.correction[0],
+                    self._attitude.imu_delay_ns,
+                )  # fmt: skip
             yield from said

@@ -122,8 +122,9 @@ class LocalisationStage:
             self._odometry, self._smooth,
         )  # fmt: skip
         self._watch = CameraWatch(
-            camera, config.features.n_features, self._tracker, self._attitude, self._motion, times
-        )
+            camera, config.features.n_features, self._tracker, self._attitude, self._motion,
+            reckoning.level, times,
+        )  # fmt: skip
         self._t_ns = 0
         self._telemetry = TelemetryIntake(
             config.telemetry.use, self._gimbal, self._standing, flow, self._smooth.ground,

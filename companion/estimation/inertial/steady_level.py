@@ -105,6 +105,21 @@ class SteadyLevel:
         by_noise = STANDARD_GRAVITY_M_S2 * float(np.sqrt(self._noise))
         return float(np.linalg.norm([WALK_M_S2, by_noise, share * AUTOPILOT_WALK_M_S2]))
 
+    def turn(self, from_ns: int, to_ns: int) -> tuple[Array, float] | None:
+        """Rotation (3, 3) of the body at a time in its axes at another; its standard deviation.
+
+        By the gyroscopes less their bias; None where samples are missing.
+        """
+        (first, last), _, gaps = self._turns.at(np.array([from_ns, to_ns]))
+        if gaps[0] < 0 or gaps[0] != gaps[1]:
+            return None
+        dt_s = (to_ns - from_ns) * 1e-9
+        turn = first.T @ last @ rotation_from_vector(-dt_s * self._bias)
+        by_scale = TURN_RATIO * float(np.linalg.norm(vector_from_rotation(turn)))
+        by_bias = dt_s * float(np.sqrt(np.trace(self._covariance[3:, 3:]) / 3.0))
+        by_noise = float(np.sqrt(self._noise * dt_s))
+        return turn, float(np.linalg.norm([by_scale, by_bias, by_noise]))
+
     def reset(self) -> None:
         """Begin anew with the next sample, from the autopilot's attitude."""
         self._last = None

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.estimation.inertial.steady_level import SteadyLevel
 from companion.estimation.lens.focal_length import Rays, focal_ratio, turn_across_rad
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, angle_between
@@ -18,10 +19,12 @@ TURN_RAD, LEAST_TURN_RAD = np.radians(4.0), np.radians(2.0)
 """A pair is taken once the camera has turned by the first, or at last by the second."""
 LONGEST_NS = 1_500_000_000
 """Between the images of a pair: it still sees most of the same."""
-N_KNOWN, MAX_PAIRS = 20, 300
-NOTICED, SIGMAS, SURE_SIGMA = 0.04, 4.0, 0.012
-"""Difference that is said, with so many standard deviations, which must be small themselves. Over
-level ground, where a turn looks much as a way does, half of what it is off by comes out."""
+N_KNOWN, MAX_PAIRS = 10, 100
+SIGMAS, SURE_SIGMA = 4.0, 0.016
+"""Difference that is said, in standard deviations, which must be small themselves."""
+SIGMA_ALIKE = 0.01
+"""Of what pairs after each other have in common: 0.052 at most by ten and more of ten flights
+whose focal length was right, wherever in the flight they began."""
 MOUNT_RAD = SURE_SIGMA
 """A mount that was off by more tells turns about other axes than images show."""
 ROUNDS, CAUCHY = 10, 2.0
@@ -38,14 +41,13 @@ class FocalLength(NamedTuple):
 class _Start(NamedTuple):
     t_ns: int
     rays: Rays
-    ned_from_camera: Array
 
 
 class LensWatch:
     """Collects turns of a camera on a body, from one view to another of the same map."""
 
-    def __init__(self, camera: Camera) -> None:
-        self._focal_px = camera.focal_px
+    def __init__(self, camera: Camera, level: SteadyLevel) -> None:
+        self._focal_px, self._level = camera.focal_px, level
         self._mount: Array | None = None
         self._map: SlamMap | None = None
         self._start: _Start | None = None
@@ -53,10 +55,13 @@ class LensWatch:
         self.watches = True
         """False once the focal length is known: nothing that comes later would be said."""
 
-    def end(self, view: View | None, slam_map: SlamMap, body_from_camera: Array) -> list[Warned]:
+    def end(
+        self, view: View | None, slam_map: SlamMap, body_from_camera: Array, imu_delay_ns: int
+    ) -> list[Warned]:
         """Compare what was seen in a frame, if it was tracked; what is to be said.
 
-        Where the mount (3, 3) has been corrected since, turns so far do not count.
+        The stamps of the IMU are later than the camera's by a delay. Where the mount (3, 3) has
+        been corrected since, turns so far do not count.
         """
         before, self._mount = self._mount, body_from_camera
         if before is not None and angle_between(before, body_from_camera) > MOUNT_RAD:
@@ -66,24 +71,24 @@ class LensWatch:
         if not self.watches or view is None:
             return []
         n_before = len(self._pairs)
-        self.take(view, slam_map)
+        self._take(view, slam_map, body_from_camera, imu_delay_ns)
         return self._judged(view.t_ns) if len(self._pairs) > n_before else []
 
-    def take(self, view: View, slam_map: SlamMap) -> None:
-        """Add a tracked frame, whose attitude may be known by the autopilot."""
-        if view.ned_from_camera is None:
-            return
+    def _take(self, view: View, slam_map: SlamMap, body_from_camera: Array, delay_ns: int) -> None:
         start = self._start if slam_map is self._map else None
         self._map = slam_map
+        turned = None
         if start is not None:
-            turn = start.ned_from_camera.T @ view.ned_from_camera
+            turned = self._level.turn(start.t_ns + delay_ns, view.t_ns + delay_ns)
+        if start is not None and turned is not None:
+            turn = body_from_camera.T @ turned[0] @ body_from_camera
             turn_rad, late = turn_across_rad(turn), view.t_ns - start.t_ns > LONGEST_NS
             if turn_rad < TURN_RAD and not late:
                 return
             if turn_rad >= LEAST_TURN_RAD:
-                found = focal_ratio(start.rays, _rays_of(view), turn, self._focal_px)
+                found = focal_ratio(start.rays, _rays_of(view), turn, turned[1], self._focal_px)
                 self._pairs += [] if found is None else [found]
-        self._start = _Start(view.t_ns, _rays_of(view), view.ned_from_camera)
+        self._start = _Start(view.t_ns, _rays_of(view))
 
     @property
     def estimate(self) -> FocalLength | None:
@@ -96,15 +101,15 @@ class LensWatch:
             shared = weight / (1.0 + ((ratio - mean) / (CAUCHY * sigma)) ** 2)
             mean = float(shared @ ratio / shared.sum())
         spread = max(1.0, 1.48 * float(np.median(np.abs(ratio - mean) / sigma)))
-        return FocalLength(mean, spread * float(weight.sum() ** -0.5), len(ratio))
+        sigma_mean = spread * float(weight.sum() ** -0.5)
+        return FocalLength(mean, float(np.hypot(sigma_mean, SIGMA_ALIKE)), len(ratio))
 
     def _judged(self, t_ns: int) -> list[Warned]:
         found = self.estimate
         if found is None or found.sigma > SURE_SIGMA:
             return []
-        off = abs(found.ratio - 1.0)
-        is_other = off > max(NOTICED, SIGMAS * found.sigma)
-        if is_other or off + SIGMAS * found.sigma < NOTICED or found.n >= MAX_PAIRS:
+        is_other = abs(found.ratio - 1.0) > SIGMAS * found.sigma
+        if is_other or found.n >= MAX_PAIRS:
             self.watches, self._map, self._start = False, None, None
         detail = f"it seems to be {found.ratio:.2f} +- {found.sigma:.2f} times what is stated"
         return [Warned(t_ns, OTHER_LENS, detail)] if is_other else []

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from companion.estimation.inertial.steady_level import SteadyLevel
+from companion.estimation.inertial.turn_integral import TurnIntegral
 from companion.estimation.lens.lens_watch import OTHER_LENS, LensWatch
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, rotation_from_vector, yaw_rotation
@@ -20,8 +22,9 @@ from tests.support.flights.scene import DOWN_LOOKING
 Path = Callable[[float], Pose]
 TRUE = Camera(640, 480, 480.0, 480.0, 320.0, 240.0)
 GREY = np.zeros((480, 640), np.uint8)
-CORRECTED_S = 12
-NOISE_PX, SIGMA_ATTITUDE_RAD = 0.5, np.radians(0.2)
+CORRECTED_S, LATE_NS = 12, 30_000_000
+NOISE_PX, NOISE_RAD = 0.5, 3e-4
+"""The second of a gyroscope, per root of a second: 0.02 degrees."""
 OBLIQUE = DOWN_LOOKING @ rotation_from_vector(np.array([np.radians(35.0), 0.0, 0.0]))
 
 
@@ -32,6 +35,13 @@ def in_the_air(t_s: float) -> Pose:
     return Pose(yaw_rotation(0.8 * np.sin(0.7 * t_s)) @ rotation_from_vector(tilt), place)
 
 
+def on_the_spot(t_s: float) -> Pose:
+    """To and fro by 29 degrees in a hover."""
+    tilt = np.array([0.02 * np.sin(1.3 * t_s), 0.02 * np.sin(1.1 * t_s + 1), 0.0])
+    place = np.array([0.1 * np.sin(0.9 * t_s), 0.1 * np.cos(1.1 * t_s), -5.0])
+    return Pose(yaw_rotation(0.5 * np.sin(0.8 * t_s)) @ rotation_from_vector(tilt), place)
+
+
 def by_hand(t_s: float) -> Pose:
     """Turned about all axes at a desk, half a metre to and fro."""
     swing = np.array([0.5 * np.sin(0.9 * t_s), 0.4 * np.sin(1.1 * t_s + 1), 0.0])
@@ -39,8 +49,23 @@ def by_hand(t_s: float) -> Pose:
     return Pose(yaw_rotation(0.6 * np.sin(0.5 * t_s)) @ rotation_from_vector(swing), place)
 
 
+class Gyroscopes(SteadyLevel):
+    """Tell the turns of a path; their stamps are late."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(TurnIntegral())
+        self._path, self._rng = path, np.random.default_rng(8)
+
+    def turn(self, from_ns: int, to_ns: int) -> tuple[Array, float]:
+        """See `SteadyLevel`."""
+        first, last = (self._path((t_ns - LATE_NS) * 1e-9).rotation for t_ns in (from_ns, to_ns))
+        sigma_rad = NOISE_RAD * ((to_ns - from_ns) * 1e-9) ** 0.5
+        noise = rotation_from_vector(self._rng.normal(scale=sigma_rad, size=3))
+        return first.T @ last @ noise, sigma_rad
+
+
 def said_of(
-    stated: float, path: Path = in_the_air, relief_m: float = 3.0, seconds: float = 60.0,
+    stated: float, path: Path = in_the_air, relief_m: float = 3.0, seconds: float = 40.0,
     mount_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> list[Warned]:  # fmt: skip
     """What is said of a camera whose focal length is stated as so many times the true one.
@@ -49,33 +74,31 @@ def said_of(
     """
     rng = np.random.default_rng(7)
     camera = replace(TRUE, fx=TRUE.fx * stated, fy=TRUE.fy * stated)
-    watch, slam_map = LensWatch(camera), SlamMap(1.2, 8)
+    watch, slam_map = LensWatch(camera, Gyroscopes(path)), SlamMap(1.2, 8)
     wide = 22.0 if path is in_the_air else 3.0
     points = np.c_[rng.uniform(-wide, wide, (900, 2)), rng.uniform(-relief_m, 0, 900)]
     said: list[Warned] = []
     for k in range(int(seconds * 15)):
         off = rotation_from_vector(np.array(mount_rad) * (k < 15 * CORRECTED_S))
         body = path(k / 15)
-        ned_from_camera = body.rotation @ OBLIQUE
-        pixels = TRUE.project(Pose(ned_from_camera, body.translation).inverse().apply(points))
+        pixels = TRUE.project(
+            Pose(body.rotation @ OBLIQUE, body.translation).inverse().apply(points)
+        )
         pixels = pixels + rng.normal(scale=NOISE_PX, size=pixels.shape)
         with np.errstate(invalid="ignore"):
             ids = np.flatnonzero(((pixels > 5) & (pixels < [635, 475])).all(1))
-        measured = rotation_from_vector(rng.normal(scale=SIGMA_ATTITUDE_RAD / 2, size=3))
-        said += watch.end(
-            view_of(camera, pixels[ids], ids, k, measured @ ned_from_camera @ off), slam_map, off
-        )
+        said += watch.end(view_of(camera, pixels[ids], ids, k), slam_map, OBLIQUE @ off, LATE_NS)
     return said
 
 
-def view_of(camera: Camera, pixels: Array, ids: Ints, k: int, ned_from_camera: Array) -> View:
+def view_of(camera: Camera, pixels: Array, ids: Ints, k: int) -> View:
     n = len(ids)
     features = features_of(
         camera, 1.2, pixels.astype(np.float32), camera.normalise(pixels), np.zeros(n, np.int64),
         np.zeros(n, np.float32), np.zeros((n, 32), np.uint8),
     )  # fmt: skip
     t_ns = k * 1_000_000_000 // 15
-    return View(k, t_ns, features, ned_from_camera, GREY, Pose.identity(), ids)
+    return View(k, t_ns, features, None, GREY, Pose.identity(), ids)
 
 
 @pytest.mark.parametrize("stated", [0.9, 1.1])
@@ -87,6 +110,17 @@ def test_ten_percent_are_said_once(stated: float, path: Path, relief_m: float) -
     assert warned.what == OTHER_LENS
     ratio = float(warned.detail.split("be ")[1].split(" ")[0])
     assert ratio == pytest.approx(1.0 / stated, abs=0.04)
+
+
+@pytest.mark.parametrize(("stated", "n_said"), [(0.9, 1), (1.0, 0), (1.1, 1)])
+def test_a_turn_on_the_spot_tells_it(stated: float, n_said: int) -> None:
+    """A camera that sways by decimetres only: other focal lengths fit nearly as well."""
+    assert len(said_of(stated, on_the_spot, relief_m=0.0, seconds=10.0)) == n_said
+
+
+def test_it_is_said_after_seconds_of_turning() -> None:
+    """Before a map that bends by it is left: a lens is not flown on until then."""
+    assert said_of(1.1, by_hand, 0.6, seconds=6.0)
 
 
 @pytest.mark.parametrize("stated", [0.98, 1.0, 1.02])
