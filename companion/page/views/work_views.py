@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 from starlette.requests import Request
@@ -13,7 +14,7 @@ from companion.page.views.setting_views import SettingViews
 from companion.page.views.site import Form, Site
 
 
-class WorkViews:
+class WorkViews(ABC):
     """Base class of such views. `kind` is that of the work, and names route and templates."""
 
     kind: str
@@ -34,17 +35,17 @@ class WorkViews:
             Route(f"{self._path}/use", changing(self._use), methods=["POST"]),
         ]
 
+    @abstractmethod
     def _command(self, form: Form) -> tuple[str, list[str]]:
         """Subject of the work that a form asks for, and its command; RefusedError."""
-        raise NotImplementedError
 
+    @abstractmethod
     async def _use(self, request: Request, form: Form) -> Response:
         """Keep the result in the settings; RefusedError without one."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _values(self) -> dict[str, Any]:
         """Values of the templates, beside the work."""
-        raise NotImplementedError
 
     async def _show(self, request: Request) -> Response:
         return await self._render(request, f"{self.kind}.html.j2")

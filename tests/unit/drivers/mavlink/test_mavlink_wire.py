@@ -7,6 +7,7 @@ import contextlib
 import os
 import socket
 import time
+from collections.abc import AsyncIterator
 from functools import partial
 from pathlib import Path
 
@@ -201,33 +202,39 @@ async def test_tcp_comes_back_by_itself() -> None:
     assert wire.n_dropped == 2
 
 
-async def test_a_tcp_peer_that_never_reads_costs_the_oldest_and_no_time() -> None:
+@contextlib.asynccontextmanager
+async def taken() -> AsyncIterator[tuple[TcpWire, socket.socket, socket.socket]]:
+    """A running wire that a server has taken; the server, and its end."""
     with socket.create_server((HOST, 0)) as server:
         server.setblocking(False)
-        endpoint = Endpoint("tcp", HOST, server.getsockname()[1])
-        wire = TcpWire(endpoint, PacketQueue(64_000))
+        wire = TcpWire(Endpoint("tcp", HOST, server.getsockname()[1]), PacketQueue(64_000))
         async with running(wire.run(Ear())):
             client, _ = await asyncio.get_running_loop().sock_accept(server)
             with client:
                 await until(lambda: wire.connected)
-                waits, n_sent = Waits(), 20_000
-                speaker = Speaker()
-                for i in range(n_sent):
-                    packet = speaker.attitude(i)
-                    with waits:
-                        wire.write(packet)
-                assert wire.queue.n_bytes <= 64_000
-                assert wire.n_dropped > 0
-                assert waits.n <= RECLAIMS
-                assert waits.longest_busy_s < 0.05
-                # what does come through is whole packets, the newest among them
-                ear = Ear()
-                client.setblocking(False)
-                while not (ear.packets and ear.packets[-1].seq == (n_sent - 1) % 256):
-                    ear.received(await asyncio.get_running_loop().sock_recv(client, 65536), 0)
-                    await asyncio.sleep(0)
-                assert ear.stream.n_bad_bytes == 0
-                assert len(ear.packets) + wire.n_dropped == n_sent
+                yield wire, server, client
+
+
+async def test_a_tcp_peer_that_never_reads_costs_the_oldest_and_no_time() -> None:
+    async with taken() as (wire, _, client):
+        waits, n_sent = Waits(), 20_000
+        speaker = Speaker()
+        for i in range(n_sent):
+            packet = speaker.attitude(i)
+            with waits:
+                wire.write(packet)
+        assert wire.queue.n_bytes <= 64_000
+        assert wire.n_dropped > 0
+        assert waits.n <= RECLAIMS
+        assert waits.longest_busy_s < 0.05
+        # what does come through is whole packets, the newest among them
+        ear = Ear()
+        client.setblocking(False)
+        while not (ear.packets and ear.packets[-1].seq == (n_sent - 1) % 256):
+            ear.received(await asyncio.get_running_loop().sock_recv(client, 65536), 0)
+            await asyncio.sleep(0)
+        assert ear.stream.n_bad_bytes == 0
+        assert len(ear.packets) + wire.n_dropped == n_sent
 
 
 async def test_a_wire_ends_whenever_it_is_cancelled() -> None:
@@ -258,32 +265,19 @@ async def test_a_tcp_peer_that_answers_no_call_is_named(monkeypatch: pytest.Monk
             await until(lambda: "no answer" in wire.trouble)
 
 
-def test_a_tcp_peer_that_reads_nothing_for_long_is_given_up() -> None:
-    async def scene() -> None:
-        with socket.create_server((HOST, 0)) as server:
-            server.setblocking(False)
-            endpoint = Endpoint("tcp", HOST, server.getsockname()[1])
-            wire = TcpWire(endpoint, PacketQueue(64_000))
-            async with running(wire.run(Ear())):
-                client, _ = await asyncio.get_running_loop().sock_accept(server)
-                with client:
-                    await until(lambda: wire.connected)
-                    while not wire.queue:
-                        wire.write(bytes(10_000))
-                    wire.write(b"not so soon")
-                    assert wire.connected
-                    wire._progress_ns -= STALLED_NS
-                    wire.write(b"now")
-                    assert not wire.connected
-                    assert "nothing was taken for 30 s" in await ended(wire)
-                    again, _ = await asyncio.get_running_loop().sock_accept(server)
-                    again.close()
-
-    async def ended(wire: TcpWire) -> str:
+async def test_a_tcp_peer_that_reads_nothing_for_long_is_given_up() -> None:
+    async with taken() as (wire, server, _):
+        while not wire.queue:
+            wire.write(bytes(10_000))
+        wire.write(b"not so soon")
+        assert wire.connected
+        wire._progress_ns -= STALLED_NS
+        wire.write(b"now")
+        assert not wire.connected
         await until(lambda: wire.trouble != "")
-        return wire.trouble
-
-    asyncio.run(scene())
+        assert "nothing was taken for 30 s" in wire.trouble
+        again, _ = await asyncio.get_running_loop().sock_accept(server)
+        again.close()
 
 
 # -- serial --------------------------------------------------------------------------------------
