@@ -160,7 +160,8 @@ class LocalisationStage:
     def step(self, message: Message | GeoOrigin) -> Iterable[Message]:
         """Process one message; messages come in order of time.
 
-        The outputs of a frame are computed lazily, the pose first: exhaust the iterator.
+        The outputs of a frame are computed lazily, what its pose depends on and the pose first:
+        exhaust the iterator.
         """
         if isinstance(message, Frame):
             return self._frame(message)
@@ -236,11 +237,12 @@ class LocalisationStage:
         with self._tracker.map_lock.tracking():
             self._t_ns = frame.t_ns
             self._take_samples()
+            # a process that is killed after the pose has told already what that came of
+            yield self._frame_tracked(frame.t_ns, frame.seq, has_picture=True)
             frame = self._watch.begin(frame)
             for out in self._tracked(frame):
                 yield self._watch.of(out, frame.seq)
             yield from self._watch.end(frame.seq)
-            yield self._frame_tracked(frame.t_ns, frame.seq, has_picture=True)
             yield from self._tracker.refined()
         yield from self._flow.of(frame)
 
@@ -251,12 +253,12 @@ class LocalisationStage:
             return
         with self._tracker.map_lock.tracking():
             self._take_samples()
+            yield self._frame_tracked(t_ns, overdue.seq, has_picture=False)
             self._odometry.apply_map_correction()
             found = self._odometry.without_frame(overdue.seq, t_ns)
             if found is not None:
                 yield found
             self._telemetry.prune(t_ns, self._segments())
-            yield self._frame_tracked(t_ns, overdue.seq, has_picture=False)
 
     def _frame_tracked(self, t_ns: int, seq: int, has_picture: bool) -> FrameTracked:
         origin, self._origin = self._origin, None

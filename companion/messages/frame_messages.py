@@ -176,7 +176,7 @@ class LandingTarget:
 
 @dataclass(frozen=True, slots=True)
 class FrameTracked:
-    """Inputs beside the image that the pose of a frame depended on; given after it.
+    """Inputs beside the image that the pose of a frame depends on; given before it.
 
     `n_samples` of telemetry had been taken since the beginning. `mapping_point` is where mapping
     stood, see `companion.slam.mapping.mapping_worker.MapLock`; `feature_ratio` the load level.
