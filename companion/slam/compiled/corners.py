@@ -69,7 +69,7 @@ def _contrast(
             ),
         )
         centre = row[x + _3]
-        out[i] = max(np.uint8(max(brightest, centre) - centre),
+        out[x] = max(np.uint8(max(brightest, centre) - centre),
                      np.uint8(centre - min(darkest, centre)))  # fmt: skip
 
 
