@@ -1,4 +1,4 @@
-"""Undistortion kernel: the radial-tangential model of companion.geometry.camera, inverted."""
+"""Lens kernels: the radial-tangential model of companion.geometry.camera, inverted; its slope."""
 
 from __future__ import annotations
 
@@ -51,3 +51,24 @@ def undistort(distorted: Array, coefficients: Array, converged: float) -> Array:
         if not max(abs(error[i, 0]), abs(error[i, 1])) < MAX_ERROR:
             n[i, 0] = n[i, 1] = np.nan
     return n
+
+
+@compiled(pairs, numbers, numbers, numbers)
+def whiten(normalised: Array, coefficients: Array, focal_px: Array, sigma_px: Array) -> Array:
+    """Derivatives (N, 2, 2) of pixels by ideal normalised coordinates (N, 2), in units of sigma.
+
+    As `Camera.pixel_from_normalised_jacobian` over `sigma_px` (N,), with the same operations in the
+    same order; `focal_px` are fx, fy.
+    """
+    k1, k2, p1, p2, k3 = coefficients
+    out = np.empty((len(normalised), 2, 2))
+    for i in range(len(normalised)):
+        x, y, sigma = normalised[i, 0], normalised[i, 1], sigma_px[i]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+        cross = slope * x * y + 2 * (p1 * x + p2 * y)
+        out[i, 0, 0] = (radial + slope * x * x + 2 * p1 * y + 6 * p2 * x) * focal_px[0] / sigma
+        out[i, 0, 1], out[i, 1, 0] = cross * focal_px[0] / sigma, cross * focal_px[1] / sigma
+        out[i, 1, 1] = (radial + slope * y * y + 6 * p1 * y + 2 * p2 * x) * focal_px[1] / sigma
+    return out

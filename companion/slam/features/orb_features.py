@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from companion.config import FeaturesConfig
@@ -14,8 +13,9 @@ from companion.messages import Bytes, Floats
 from companion.slam.compiled.compiling import Bools, Ints
 from companion.slam.compiled.corners import corners
 from companion.slam.compiled.describing import described
+from companion.slam.compiled.shrinking import shrink
 from companion.slam.compiled.spreading import spread
-from companion.slam.compiled.undistorting import undistort
+from companion.slam.compiled.undistorting import undistort, whiten
 
 __all__ = ["Bools", "FeatureExtractor", "Features", "Ints", "features_of", "normalise"]
 
@@ -55,8 +55,17 @@ def features_of(
 ) -> Features:  # fmt: skip
     """Features, with sigma and whitening derived; arguments as the fields of `Features`."""
     sigma = scale_factor ** octaves.astype(np.float64)
-    whitening = camera.pixel_from_normalised_jacobian(normalised) / sigma[:, None, None]
-    return Features(pixels, normalised, octaves, angles_deg, descriptors, sigma, whitening)
+    return Features(
+        pixels, normalised, octaves, angles_deg, descriptors, sigma,
+        _whitening(camera, normalised, sigma),
+    )  # fmt: skip
+
+
+def _whitening(camera: Camera, normalised: Array, sigma_px: Array) -> Array:
+    if camera.distortion is not Distortion.RADTAN:
+        return camera.pixel_from_normalised_jacobian(normalised) / sigma_px[:, None, None]
+    focal = np.array([camera.fx, camera.fy])
+    return whiten(normalised, np.array(camera.coefficients), focal, sigma_px)
 
 
 def normalise(camera: Camera, pixels: Floats) -> Array:
@@ -102,10 +111,12 @@ class FeatureExtractor:
         pixels += half[:, None].astype(np.float32)
         normalised = normalise(self._camera, pixels)
         seen = np.isfinite(normalised).all(1)
-        pixels, octaves, angles = pixels[seen], octaves[seen], angles[seen]
+        if not seen.all():
+            pixels, normalised, octaves = pixels[seen], normalised[seen], octaves[seen]
+            angles, descriptors = angles[seen], descriptors[seen]
         return features_of(
-            self._camera, self._config.scale_factor, pixels, normalised[seen], octaves, angles,
-            descriptors[seen],
+            self._camera, self._config.scale_factor, pixels, normalised, octaves, angles,
+            descriptors,
         )  # fmt: skip
 
     @property
@@ -117,13 +128,8 @@ class FeatureExtractor:
         if grey.shape != (self._levels[0, 2], self._levels[0, 1]):
             self._levels = _levels(grey.shape, self._scales, 4 * self._config.n_features)
             self._pyramid = np.empty(self._levels[:, 1:3].prod(1).sum(), np.uint8)
-        for i, (start, width, height, _) in enumerate(self._levels.tolist()):
-            level = self._pyramid[start : start + width * height].reshape(height, width)
-            if i == 0:
-                level[:] = grey
-            else:
-                cv2.resize(grey, (width, height), level, interpolation=cv2.INTER_LINEAR_EXACT)
-            grey = level
+        self._pyramid[: grey.size].reshape(grey.shape)[:] = grey
+        shrink(self._pyramid, self._levels)
 
     def _detect(self) -> tuple[Ints, Ints, Floats, Floats]:
         """FAST corners with an adaptive threshold: low contrast has some too; as of `corners`."""
