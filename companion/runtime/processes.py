@@ -44,7 +44,12 @@ class Supervisor:
 
 
 class Processes:
-    """Processes of the given stages. `publish` may be called from any thread, and never waits."""
+    """Processes of the given stages, from `start` on.
+
+    `publish` may be called from any thread, and never waits. What a stage's own thread changes is
+    changed with the lock held: which process a stage has, how often it was started, and whether the
+    flight has begun or is over.
+    """
 
     def __init__(self, stages: Iterable[Stage], start: Start, supervisor: Supervisor) -> None:
         allow_descriptors()
@@ -59,6 +64,8 @@ class Processes:
         """and those that get no frames."""
         self.n_restarted = dict.fromkeys(self._rows, 0)
         self._lock = threading.Lock()
+        self._map_lock = threading.Lock()
+        """Held while a map is passed on: a stage never gets an older one after a newer one."""
         self._over = threading.Event()
         self._flies = False
         self._hurry_s: float | None = None
@@ -70,11 +77,15 @@ class Processes:
         """Devices that were at work when a stage was ended for not answering."""
         self._added: set[str] = set()
         self.by_name: dict[str, StageProcess] = {}
+
+    def start(self) -> None:
+        """Start all processes; callbacks may come before it returns. OSError or RuntimeError."""
         try:
-            for stage in self._rows.values():
-                self.by_name[stage.name] = self._start(stage)
-            for stage in self._rows.values():
-                self._set_up(stage)
+            with self._lock:
+                for stage in self._rows.values():
+                    self.by_name[stage.name] = self._start(stage)
+                for stage in self._rows.values():
+                    self._set_up(stage)
         except BaseException:  # no process, thread or descriptor for one: nobody ends the others
             self._over.set()
             for process in self.by_name.values():
@@ -97,10 +108,11 @@ class Processes:
 
     def fly(self) -> None:
         """Begin the flight: the stages that begin with it get their setup."""
-        self._flies = True
-        for stage in self._rows.values():
-            if stage.with_flight:
-                self._set_up(stage)
+        with self._lock:
+            self._flies = True
+            for stage in self._rows.values():
+                if stage.with_flight:
+                    self._set_up(stage)
 
     def add(self, stage: Stage) -> None:
         """Start a stage during the flight; OSError or RuntimeError where no process can begin."""
@@ -117,8 +129,14 @@ class Processes:
 
     def publish(self, parcel: Parcel) -> None:
         """Pass a message to all stages that listen to it."""
-        if parcel.kind == MAP:
+        if parcel.kind != MAP:
+            self._offer(parcel)
+            return
+        with self._map_lock:
             self._newest_map = parcel
+            self._offer(parcel)
+
+    def _offer(self, parcel: Parcel) -> None:
         for name, process in list(self.by_name.items()):
             if parcel.kind not in self._listens[name] or name in self.muted:
                 continue
@@ -137,8 +155,9 @@ class Processes:
 
     def bring_up_to_date(self, name: str) -> None:
         """Give a stage that starts in flight the newest map."""
-        if self._newest_map is not None and MAP in self._listens[name]:
-            self.by_name[name].offer(self._newest_map)
+        with self._map_lock:
+            if self._newest_map is not None and MAP in self._listens[name]:
+                self.by_name[name].offer(self._newest_map)
 
     def end_stalled(self) -> None:
         """End stages that hang, so that they are restarted."""

@@ -212,12 +212,13 @@ class StageProcess:
             self._hang_up()  # it would live on and get nothing
 
     def _read(self) -> None:
-        try:
-            while True:
-                for parcel in Parcel.receive(self._socket):
-                    self._take(parcel)
-        except (OSError, EOFError):
-            pass
+        while True:
+            try:
+                parcels = Parcel.receive(self._socket)
+            except (OSError, EOFError):
+                break
+            for parcel in parcels:
+                self._take(parcel)
         self._outbox.hear_gone()
         status = self._child.wait()
         why = self.failed.why if self.failed is not None else self._interrupted

@@ -124,6 +124,7 @@ class LiveFlight:
                 self._setup, self._hear, self._say_restarted, self._die, self._listener.unusable
             ),
         )
+        self._processes.start()
 
     @property
     def stages(self) -> dict[str, StageProcess]:

@@ -33,6 +33,7 @@ class RemoteViewing:
             Supervisor(setup, self._hear, self._say_restarted, lambda why: None, lambda why: None),
         )
         self._viewing = Viewing(config, lambda: self._processes.by_name[VIEWERS], warn)
+        self._processes.start()
         self._processes.fly()
 
     def take(self, message: Message) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -75,6 +76,7 @@ class Flight:
                 lambda why: note(Ended("unusable", why)),
             ),
         )  # fmt: skip
+        self.processes.start()
 
     def close(self) -> None:
         """End what is left of it."""
@@ -312,6 +314,18 @@ def test_where_one_stage_cannot_be_started_none_is_left(refusal: Exception) -> N
     with pytest.raises(type(refusal)):
         Flight(start=start)
     assert [child.poll() for child in begun] == [-signal.SIGKILL] * 2
+
+
+def test_a_source_that_ends_as_it_is_started_is_told_each_time(fly: Fly) -> None:
+    """Its thread may be there before the executor knows the process."""
+
+    def start(name: str, descriptor: int) -> Child:
+        child = subprocess.Popen(["true"])
+        child.wait()
+        return child
+
+    for _ in range(20):
+        fly(SOURCE, start=start).until_ended("over", "ended with status 0")
 
 
 def test_a_stage_that_cannot_be_added_now_can_be_later(fly: Fly) -> None:
