@@ -109,11 +109,13 @@ class DiskWriter:
                 self._n_waiting += len(packet)
 
     def close(self) -> None:
-        """Write the rest, and the index; waits for it."""
+        """Write the rest, and the index; waits for it. Raises as `put` does."""
         with self._changed:
             self._closing = True
             self._changed.notify()
         self._thread.join()
+        if self._fault is not None:
+            raise self._fault
 
     def _run(self) -> None:
         try:
@@ -180,14 +182,18 @@ class DiskWriter:
                 if not self._delete_oldest():
                     self._end(FULL, str(self._flight))
                     return
-        except (OSError, FlightError) as error:
+        except OSError as error:
             self._end(FAILED, str(error))
 
     def _delete_oldest(self) -> bool:
         """Delete the oldest flight; whether space was made."""
         if self._config.when_full != "prune":
             return False
-        for flight in may_go(flights_in(self._flight.parent), but=self._flight):
+        try:
+            flights = flights_in(self._flight.parent)
+        except (OSError, FlightError):  # a folder that cannot be read has none that may go
+            return False
+        for flight in may_go(flights, but=self._flight):
             try:
                 delete(flight)
             except OSError:

@@ -110,13 +110,14 @@ class Recorder:
             toml = to_toml(with_passwords_hidden(config)).encode()
             writer.attach(CONFIG_TOML, "application/toml", toml, 0)
             writer.note(NOTES, {**versions, "pictures": self._encoder.name, "flight": folder.name})
+            self._disk = DiskWriter(
+                self._config, files[0], writer, files[1], folder, lambda: self._newest_ns,
+                self._warned,
+            )  # fmt: skip
         except OSError as error:
             for file in files:
                 file.discard()
             raise StageError(f"{folder}: cannot be recorded to: {error.strerror}") from error
-        self._disk = DiskWriter(
-            self._config, files[0], writer, files[1], folder, lambda: self._newest_ns, self._warned
-        )
 
     @property
     def n_dropped(self) -> Counter[str]:
@@ -190,7 +191,6 @@ class Recorder:
             self._skips_until_intra = not self._disk.put(entry, "pictures", is_picture=True)
             if self._skips_until_intra:
                 self._encoder.request_intra()
-                return
 
     def _link(self, taken: LinkBytes) -> None:
         self._put(SENT if taken.outgoing else RECEIVED, taken.t_ns, link_bytes(taken))

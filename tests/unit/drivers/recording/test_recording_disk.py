@@ -1,3 +1,4 @@
+import errno
 import os
 import subprocess
 import time
@@ -8,8 +9,10 @@ import numpy as np
 import pytest
 
 from companion.config import CameraConfig, Config, RecorderConfig, TelemetryConfig
+from companion.errors import FlightError, StageError
 from companion.flight_notes import LinkBytes
 from companion.messages import Frame, Warned
+from drivers.recording import disk_writer
 from drivers.recording.disk_writer import CHUNK_BYTES, FULL, PRUNED, RESERVE_BYTES, SLOW
 from drivers.recording.flights_folder import UNARMED, flights_in, flown_in, may_go
 from drivers.recording.recorded_flight import RecordedFlight, open_recording
@@ -103,6 +106,42 @@ def test_the_oldest_flights_make_room_but_not_those_to_be_kept(small_disk: Path)
     assert not oldest.exists() and kept.exists() and foreign.exists()
     assert older.exists() == (len(told) == 1)
     assert opened(small_disk / "2026-01-01T00-00-00Z").n_frames == 75
+
+
+def test_on_a_full_disk_flights_that_cannot_be_listed_are_not_pruned(
+    small_disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreadable(_: Path) -> list[object]:
+        raise FlightError("cannot be read")
+
+    monkeypatch.setattr(disk_writer, "flights_in", unreadable)
+    recorder = recorder_in(small_disk / "2026-01-01T00-00-00Z", when_full="prune", least_free_mb=0)
+    assert [warned.what for warned in fly(recorder, 250, 0.001)] == [FULL]
+
+
+def test_a_fault_of_the_last_write_is_told_by_close(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = recorder_in(tmp_path / "flight")
+
+    def wrong(_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(disk_writer.McapWriter, "finish", wrong)
+    with pytest.raises(ZeroDivisionError):
+        recorder.close()
+
+
+def test_where_no_space_can_be_reserved_the_recording_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: Path) -> None:
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    monkeypatch.setattr(disk_writer, "_reserved", full)
+    with pytest.raises(StageError, match="Disk quota exceeded"):
+        recorder_in(tmp_path / "flight")
+    assert list((tmp_path / "flight").iterdir()) == []
 
 
 @pytest.mark.real_time
