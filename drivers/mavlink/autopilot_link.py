@@ -257,6 +257,8 @@ class AutopilotLink:
         self._meter.came(now_ns)
 
     def _take_heartbeat(self, message: Any, receive_ns: int) -> None:
+        if not is_autopilot(message):
+            return
         self.vehicle = vehicle_of(message)
         if self.vehicle.armed is not self._armed:
             self._armed = self.vehicle.armed

@@ -647,6 +647,16 @@ async def test_arming_is_reported_on_change() -> None:
         assert told == [False, True, False]
 
 
+async def test_a_heartbeat_of_no_autopilot_says_nothing_of_the_vehicle() -> None:
+    """A ground station that goes by the vehicle's own number, and the autopilot's component."""
+    async with spoken() as (heard, _port, talk):
+        talk.say(heartbeat(armed=True), 1.0)
+        talk.say(heartbeat(autopilot=mavlink.MAV_AUTOPILOT_INVALID), 1.1)
+        told = [each.armed for each in heard.samples if isinstance(each, ArmedSample)]
+        assert told == [False, True]
+        assert heard.link.vehicle is not None and heard.link.vehicle.firmware == "ardupilot"
+
+
 async def test_of_two_attitudes_the_more_frequent_is_taken() -> None:
     def quaternion(boot_ms: int) -> Any:
         return mavlink.MAVLink_attitude_quaternion_message(
