@@ -1,8 +1,9 @@
 """The daemon: joins camera, autopilot and stages, from power on to power off.
 
 The event loop does I/O only. The camera has a thread, every heavy stage a process; their output
-comes in by `call_soon_threadsafe`. No failure in flight ends it: the part is reported and
-restarted.
+comes in by `call_soon_threadsafe`. A camera, link or stage that fails is reported and restarted; a
+bug in what the pose can do without ends that part alone (`_spared_work`), and one elsewhere ends
+the daemon, which the service manager starts again with the map that was kept.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from companion.daemon.page_child import PageChild, SettingsSource
 from companion.daemon.periodic_checks import PeriodicChecks
 from companion.daemon.pose.senders import Senders
 from companion.daemon.recorder_notes import RecorderNotes
+from companion.daemon.spared import spared
 from companion.daemon.status_document import StatusDocument
 from companion.daemon.stop_request import StopRequest
 from companion.daemon.vehicle_reports import VehicleReports, flight_recording
@@ -172,12 +174,13 @@ class Daemon:
             await parts[-1].start()
         self._feed.start()
         tasks = [loop.create_task(each) for each in self._work()]
+        spared_tasks = [loop.create_task(each) for each in self._spared_work()]
         stopped: asyncio.Task[Any] = loop.create_task(self._stop.wait())
         try:
             await asyncio.wait([stopped, *tasks], return_when=asyncio.FIRST_COMPLETED)
             for task in tasks:
-                if task.done() and not task.cancelled() and task.exception() is not None:
-                    raise task.exception() or AssertionError
+                if task.done() and not task.cancelled():
+                    task.result()  # raises what has ended it
         finally:
             self._service.stopping()
             if self._link is not None:
@@ -188,9 +191,9 @@ class Daemon:
             await self._flights.close(
                 END_S, lambda: self._stop.hurried, keep_map=self._settings.armed
             )
-            for task in (stopped, *tasks):
+            for task in (stopped, *tasks, *spared_tasks):
                 task.cancel()
-            await asyncio.gather(stopped, *tasks, return_exceptions=True)
+            await asyncio.gather(stopped, *tasks, *spared_tasks, return_exceptions=True)
             for part in reversed(parts):
                 await part.stop()
             await asyncio.wait([feed_closed], timeout=0.2)
@@ -211,13 +214,10 @@ class Daemon:
         work: list[Coroutine[Any, Any, None]] = [
             self._checks.run(),
             self._watch.govern(),
-            measure_loop_delay(self._clock, self._loop_delay),
             self._notice_overdue(),
-            self._notes.run(),
-            self._recovery.run(),
         ]
         feedback = self._settings.config.feedback
-        for part in (self._link, self._senders, self._reports, self._ground, self._page):
+        for part in (self._link, self._senders, self._reports, self._ground):
             if part is not None:
                 work.append(part.run())
         if self._link is not None and feedback.set_origin:
@@ -228,6 +228,17 @@ class Daemon:
             )  # fmt: skip
             work.append(keeper.run())
         return work
+
+    def _spared_work(self) -> list[Coroutine[Any, Any, None]]:
+        """Tasks of the event loop that the pose does not need."""
+        work = {
+            "the event loop's delay": measure_loop_delay(self._clock, self._loop_delay),
+            "the recorder's notes": self._notes.run(),
+            "the repair of recordings": self._recovery.run(),
+        }
+        if self._page is not None:
+            work["the page"] = self._page.run()
+        return [spared(name, part, self._problem) for name, part in work.items()]
 
     # -- what comes in --------------------------------------------------------------------------
 
@@ -301,8 +312,8 @@ class Daemon:
         if self._link is not None:
             self._link.say(text)
 
-    def _problem(self, text: str) -> None:
-        self._on_warned(Warned(self._clock.now_ns(), text))
+    def _problem(self, what: str, detail: str = "") -> None:
+        self._on_warned(Warned(self._clock.now_ns(), what, detail))
 
     def _soon(self, call: Callable[..., object], *arguments: Any) -> None:
         """Call in the event loop; from any thread, ignored once the loop has ended."""
