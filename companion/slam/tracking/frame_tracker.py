@@ -53,20 +53,21 @@ class FrameTracker:
 
     def match(
         self, view: View, guess: Pose, ids: Ints, radius_px: float, count: bool = False,
-        min_inliers: int = 0,
+        min_inliers: int = 0, slam_map: SlamMap | None = None,
     ) -> bool:  # fmt: skip
         """Match points `ids` projected from `guess` within a radius and refine the pose; success.
 
         With `count` the visibility statistics of the points are updated. At least `min_inliers` are
-        required.
+        required. The points are of the active map, unless another is given.
         """
-        visible = self._projector.visible(self._map, guess, ids)
-        points, found = self._projector.search(self._map, visible, view.features, radius_px)
+        slam_map = slam_map or self._map
+        visible = self._projector.visible(slam_map, guess, ids)
+        points, found = self._projector.search(slam_map, visible, view.features, radius_px)
         if len(points) < self._config.min_inliers:
             return False
         features = view.features
         pose, inlier, information = refine_pose(
-            guess, self._map.positions[points], features.normalised[found],
+            guess, slam_map.positions[points], features.normalised[found],
             features.whitening[found], rounds=4 if count else 2,  # at first roughly
         )  # fmt: skip
         n = int(inlier.sum())
@@ -84,8 +85,8 @@ class FrameTracker:
         view.point_ids[found[inlier]] = points[inlier]
         view.n_matches = len(points)
         if count:
-            self._map.n_visible[visible.ids] += 1
-            self._map.n_found[points[inlier]] += 1
+            slam_map.n_visible[visible.ids] += 1
+            slam_map.n_found[points[inlier]] += 1
         return True
 
     def match_turned(self, view: View, guess: Pose, last: View, min_inliers: int) -> bool:
@@ -147,15 +148,14 @@ class FrameTracker:
         relocalised = self._atlas.relocalise_by(
             view.features, keyframe, view.level_from_camera, view.seq
         )
-        return relocalised is not None and self.verify(view, relocalised)
+        return relocalised is not None and self.verify(view, relocalised, self._map)
 
-    def verify(self, view: View, relocalised: Relocalised) -> bool:
-        """Verify a relocalised pose by the local map around it."""
-        view.camera_from_map = relocalised.camera_from_map
-        view.point_ids[:] = -1
-        view.point_ids[relocalised.features] = relocalised.points
-        self.update_local_map(view)
-        return self.match(view, relocalised.camera_from_map, self.local, 12.0)
+    def verify(self, view: View, relocalised: Relocalised, slam_map: SlamMap) -> bool:
+        """Verify a pose that was relocalised in a map, by that map's points around it."""
+        guess = relocalised.camera_from_map
+        centre = guess.inverse().translation
+        around = local_points(slam_map, relocalised.points, centre)
+        return self.match(view, guess, around, 12.0, slam_map=slam_map)
 
     def update_local_map(self, view: View) -> None:
         """Set the local map to the points around a tracked view."""

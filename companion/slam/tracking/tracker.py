@@ -325,16 +325,18 @@ class Tracker:
         return self._frame_tracker.relocalise_by(view, reference)
 
     def _relocalise(self, view: View) -> bool:
-        """Relocalise in any map, which becomes the active one."""
+        """Relocalise in any map, which becomes the active one once the pose is verified there."""
         found = self.atlas.relocalise(view.features, view.level_from_camera, view.seq)
         if found is None:
             return False
         segment, relocalised = found
+        if not self._frame_tracker.verify(view, relocalised, segment):
+            return False
         if segment is not self.map:
             self.atlas.switch_to(segment)
             self._reset()
             self.keyframes.reference = relocalised.keyframe
-        return self._frame_tracker.verify(view, relocalised)
+        return True
 
     def _may_restart(self, t_ns: int, has_attitude: bool) -> bool:
         """True if tracking has been lost for long enough to initialise another map."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -12,6 +13,8 @@ from companion.config import Config
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Array, Pose, angle_between, rotation_from_vector
 from companion.messages import Frame, KeyframeAdded, Track, TrackState
+from companion.slam.loop.relocalizer import Relocalised
+from companion.slam.map.sparse_map import SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
 from tests.support.flights.scene import DOWN_LOOKING, PlaneWorld, aligned_error
 
@@ -141,6 +144,35 @@ def test_image_dropout_is_reported_lost_and_relocalised_in_the_same_map(
     assert len(tracker.segments) == 1
     error, _ = aligned_error(*positions(tracker, tracks))
     assert error < 0.12
+
+
+def test_a_pose_in_another_map_that_is_not_verified_leaves_the_active_one(
+    images: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Descriptors alike find a place in another map, whose points then do not match there."""
+    tracker, _, _ = run(images[:25], attitude=True)
+    active, (other, tracks, _) = tracker.map, run(images[:25], attitude=True)
+    tracker.atlas.segments.insert(0, other.map)
+    keyframe = next(iter(other.map.keyframes.values()))
+    features, points = other.map.observations_of(keyframe)
+    pose = tracks[24].map_from_camera
+    assert pose is not None
+
+    def found(off_m: float) -> Callable[..., tuple[SlamMap, Relocalised]]:
+        place = Pose(pose.rotation, pose.translation + [off_m, 0.0, 0.0]).inverse()
+        return lambda *_: (other.map, Relocalised(place, points, features, keyframe))
+
+    def step(seq: int, off_m: float) -> TrackState:
+        monkeypatch.setattr(tracker.atlas, "relocalise", found(off_m))
+        grey = images[24]
+        frame = Frame(seq, seq * 100_000_000, grey, np.repeat(grey[..., None], 3, 2))
+        tracker.step(frame, Prior(None, None))
+        return tracker.state
+
+    assert step(25, 3.0) is TrackState.LOST
+    assert tracker.map is active
+    assert step(26, 0.0) is TrackState.TRACKING
+    assert tracker.map is other.map
 
 
 def test_pure_rotation_initialises_no_map() -> None:
