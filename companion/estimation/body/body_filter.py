@@ -39,6 +39,7 @@ from companion.estimation.body.body_state import (
     held,
     propagated,
 )
+from companion.estimation.body.refused_run import RefusedRun
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_motion import (
     BIAS,
@@ -64,10 +65,12 @@ NORMALISED_TAU = 30
 """Places, two seconds of them."""
 TELL_LEVEL = Aid.PLACE, Aid.FLOW, Aid.REST
 MAX_REFUSED_NS = 1_000_000_000
-"""Places refused for longer are believed: the filter begins anew."""
+"""Places refused in a row for longer are believed: the filter begins anew. Where none came for so
+long, a row ends."""
 SHOCK_NS = 500_000_000
-"""Rest refused for so long is believed: a blow has stopped the body. Accelerometers sample it too
-seldom to measure it, and what they are off by afterwards is no bias."""
+"""Rest refused in a row for so long, while no place is accepted, is believed: a blow has stopped
+the body. Accelerometers sample it too seldom to measure it, and what they are off by afterwards is
+no bias."""
 
 
 class BodyFilter:
@@ -84,9 +87,9 @@ class BodyFilter:
         self._waiting: deque[Aiding] = deque()
         self._taken: deque[tuple[BodyState, Aiding]] = deque()
         """The latest measurements, and the state before each."""
-        self._refused_since_ns: int | None = None
-        self._newest_place_ns = self._aided_ns = 0
-        self._shaken_since_ns: int | None = None
+        self._refused_places = RefusedRun(MAX_REFUSED_NS)
+        self._refused_rests = RefusedRun(MAX_HELD_NS)
+        self._aided_ns = 0
         self._normalised = 1.0
         """Mean squared innovation per degree of freedom, of the latest places."""
         self._n_refused = Counter[str]()
@@ -110,7 +113,7 @@ class BodyFilter:
     @property
     def refuses(self) -> bool:
         """True where the innovation gate has refused the newest place, and the one before."""
-        return self._refused_since_ns not in (None, self._newest_place_ns)
+        return self._refused_places.repeated
 
     @property
     def n_refused(self) -> dict[str, int]:
@@ -134,6 +137,8 @@ class BodyFilter:
     def reset(self) -> None:
         """Forget place, velocity and heights; bias and tilt are the same in another map."""
         self._state, self._begun = self._state.without(GROUND, BAROMETER), False
+        self._refused_places.end()
+        self._refused_rests.end()
         self._waiting.clear()
         self._taken.clear()
 
@@ -149,7 +154,7 @@ class BodyFilter:
         self._state = self._state._replace(covariance=covariance)
         self._waiting = deque(each for each in self._waiting if not isinstance(each, AidedPlace))
         self._taken.clear()
-        self._refused_since_ns = None
+        self._refused_places.end()
 
     def forget(self) -> None:
         """Forget all: the accelerations were wrong."""
@@ -265,7 +270,8 @@ class BodyFilter:
             return
         if isinstance(measured, AidedPlace) and measured.sigma_scale is not None:
             self._taken.append((before, measured))
-            self._state, self._refused_since_ns = _placed(state, measured), None
+            self._state = _placed(state, measured)
+            self._refused_places.end()
             return
         model = model_of(measured, state)
         if model is None:
@@ -303,19 +309,19 @@ class BodyFilter:
 
     def _judge(self, place: AidedPlace, refused: bool) -> None:
         """Begin anew with a place, where places have been refused for too long."""
-        since_ns = self._refused_since_ns if self._refused_since_ns is not None else place.t_ns
-        self._refused_since_ns = since_ns if refused else None
-        self._newest_place_ns = place.t_ns
-        if refused and place.t_ns - since_ns > MAX_REFUSED_NS:
+        if not refused:
+            self._refused_places.end()
+            self._refused_rests.end()
+        elif self._refused_places.refuse(place.t_ns) > MAX_REFUSED_NS:
             self._begin(place)
 
     def _judge_rest(self, state: BodyState, rest: AidedRest, refused: bool) -> None:
         """Take a body to rest, with a state at its time, where that was refused for too long."""
-        since_ns = self._shaken_since_ns if self._shaken_since_ns is not None else rest.t_ns
-        self._shaken_since_ns = since_ns if refused else None
-        if refused and rest.t_ns - since_ns >= SHOCK_NS:
+        if not refused:
+            self._refused_rests.end()
+        elif self._refused_rests.refuse(rest.t_ns) >= SHOCK_NS:
             self._state = state.with_part(VELOCITY, np.zeros(3), rest.sigma_m_s)
-            self._shaken_since_ns = None
+            self._refused_rests.end()
             self._taken.clear()
 
     def _begin(self, place: AidedPlace) -> None:
@@ -327,7 +333,8 @@ class BodyFilter:
             state = state.with_part(DRIFT, state.mean[DRIFT], SIGMA_DRIFT_M_S3)
         state = _placed(state, place).with_part(VELOCITY, np.zeros(3), SIGMA_SPEED_M_S)
         self._state = state._replace(t_ns=place.t_ns, world_from_attitude=place.world_from_attitude)
-        self._begun, self._refused_since_ns, self._aided_ns = True, None, place.t_ns
+        self._begun, self._aided_ns = True, place.t_ns
+        self._refused_places.end()
         self._taken.clear()
 
 

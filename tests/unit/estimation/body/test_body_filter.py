@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from companion.estimation.body.aiding import AidedFlow, AidedHeight, AidedPlace
+from companion.estimation.body.aiding import AidedFlow, AidedHeight, AidedPlace, AidedRest
 from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.body.body_state import N_STATE, BodyState
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
@@ -16,6 +16,7 @@ from tests.support.flights.measured_motion import (
     STEP_S,
     MeasuredMotion,
     hovering,
+    straight,
     turned,
     velocity,
     weaving,
@@ -176,6 +177,39 @@ def test_places_refused_for_a_second_are_believed() -> None:
     found = flown.navigation.at(round((AIDED_S + 2.3) * 1e9))
     assert found is not None
     assert np.linalg.norm(found.place_m - WORLD_FROM_NED @ hovering(0.0) - jump) < 0.2
+
+
+def test_a_wrong_place_before_a_blind_span_does_not_make_the_next_one_believed() -> None:
+    """The last place before loss and the first after it are refused: two outliers, not a row."""
+    flown = Flown(weaving, 5, 4.0)
+    for t_s in (AIDED_S + 0.1, AIDED_S + 2.1):
+        wrong = WORLD_FROM_NED @ weaving(t_s) + [0.0, 0.0, 3.0]
+        flown.navigation.aid(AidedPlace(round(t_s * 1e9), wrong, WORLD_FROM_NED, SIGMA_M))
+    assert flown.navigation.n_refused == {"place": 2}
+    place, speed, *_ = flown.error(AIDED_S + 2.2)
+    assert np.linalg.norm(place) < 0.5 and np.linalg.norm(speed) < 0.5
+
+
+def test_rests_refused_seconds_apart_do_not_stop_a_moving_body() -> None:
+    flown = Flown(weaving, 5, 4.0)
+    for i in range(45):
+        t_s = AIDED_S + i / 15.0
+        t_ns, at = round(t_s * 1e9), WORLD_FROM_NED @ weaving(t_s)
+        flown.navigation.aid(AidedPlace(t_ns, at, WORLD_FROM_NED, SIGMA_M))
+        if i in (14, 44):
+            flown.navigation.aid(AidedRest(t_ns, 0.05))
+    assert flown.navigation.n_refused == {"rest": 2}
+    _, speed, *_ = flown.error(AIDED_S + 3.0)
+    assert np.linalg.norm(speed) < 0.2
+
+
+def test_rests_refused_in_a_row_stop_a_body_that_hit_the_ground() -> None:
+    flown = Flown(straight, 5, 2.0)
+    for t_s in np.arange(AIDED_S, AIDED_S + 0.9, 0.2).tolist():
+        flown.navigation.aid(AidedRest(round(t_s * 1e9), 0.05))
+    found = flown.navigation.at(round((AIDED_S + 0.81) * 1e9))
+    assert found is not None
+    assert np.linalg.norm(found.velocity_m_s) < 0.2
 
 
 def test_without_accelerations_the_velocity_is_held_for_a_moment() -> None:
