@@ -15,6 +15,7 @@ from companion.messages import Frame, Warned
 from drivers.recording import disk_writer
 from drivers.recording.disk_writer import CHUNK_BYTES, FULL, PRUNED, RESERVE_BYTES, SLOW
 from drivers.recording.flights_folder import UNARMED, flights_in, flown_in, may_go
+from drivers.recording.mcap_writer import McapWriter
 from drivers.recording.recorded_flight import RecordedFlight, open_recording
 from drivers.recording.recorder import Recorder
 from tests.support.flights.recorded import SIZE, START_NS, STEP_NS, camera, record
@@ -127,7 +128,7 @@ def test_a_fault_of_the_last_write_is_told_by_close(
     def wrong(_: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(disk_writer.McapWriter, "finish", wrong)
+    monkeypatch.setattr(McapWriter, "finish", wrong)
     with pytest.raises(ZeroDivisionError):
         recorder.close()
 
