@@ -286,6 +286,8 @@ class BodyFilter:
         if corrected is None:
             self._n_refused[model.kind.value] += 1
         if isinstance(measured, AidedPlace):
+            # a refused one shows that it does not fit, not by how much those that fit are off
+            squared = min(squared, REFUSED[3])
             self._normalised += (squared / 3.0 - self._normalised) / NORMALISED_TAU
             self._judge(measured, refused=corrected is None)
         if isinstance(measured, AidedRest):

@@ -190,6 +190,15 @@ def test_a_wrong_place_before_a_blind_span_does_not_make_the_next_one_believed()
     assert np.linalg.norm(place) < 0.5 and np.linalg.norm(speed) < 0.5
 
 
+def test_an_outlier_does_not_make_the_rest_much_less_certain() -> None:
+    flown, disturbed = Flown(weaving, 5, 1.0), Flown(weaving, 5, 1.0)
+    t_s = AIDED_S + 0.1
+    wrong = WORLD_FROM_NED @ weaving(t_s) + [0.0, 0.0, 3.0]
+    disturbed.navigation.aid(AidedPlace(round(t_s * 1e9), wrong, WORLD_FROM_NED, SIGMA_M))
+    sigma_m, stated_m = (each.error(AIDED_S + 0.5)[2] for each in (flown, disturbed))
+    assert sigma_m < stated_m < 1.1 * sigma_m
+
+
 def test_rests_refused_seconds_apart_do_not_stop_a_moving_body() -> None:
     flown = Flown(weaving, 5, 4.0)
     for i in range(45):

