@@ -265,8 +265,8 @@ class BodyFilter:
         if isinstance(measured, AidedPlace):
             state = state._replace(world_from_attitude=measured.world_from_attitude)
         if isinstance(measured, AidedHeight) and not state.covariance[BAROMETER, BAROMETER] > 0.0:
-            zero_m = float(before.mean[DOWN]) + measured.height_m
-            self._state = before.with_part(BAROMETER, zero_m, SIGMA_BAROMETER_M)
+            self._taken.append((before, measured))
+            self._state = state.with_barometer(measured.height_m, SIGMA_BAROMETER_M)
             return
         if isinstance(measured, AidedPlace) and measured.sigma_scale is not None:
             self._taken.append((before, measured))

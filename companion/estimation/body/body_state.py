@@ -122,6 +122,19 @@ class BodyState(NamedTuple):
         state.covariance[axes, axes] = sigma**2
         return state._replace(mean=mean)
 
+    def with_barometer(self, height_m: float, sigma_m: float) -> BodyState:
+        """The same with a barometer's zero, by its first height above that, of a known noise.
+
+        The zero is as uncertain as the body's own height, and with it: what follows tells of the
+        change of the height, and nothing of where it was.
+        """
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        mean[BAROMETER] = mean[DOWN] + height_m
+        covariance[BAROMETER, :] = covariance[DOWN, :]
+        covariance[:, BAROMETER] = covariance[:, DOWN]
+        covariance[BAROMETER, BAROMETER] = covariance[DOWN, DOWN] + sigma_m**2
+        return self._replace(mean=mean, covariance=covariance)
+
     def sigma(self, part: slice) -> float:
         """The largest standard deviation of a part along an axis."""
         return float(np.sqrt(max(np.diag(self.covariance)[part].max(), 0.0)))

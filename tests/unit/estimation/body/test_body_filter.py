@@ -372,3 +372,22 @@ def test_a_barometer_bounds_the_drift_of_the_height() -> None:
     )
     assert np.abs(aided_m).max() < 0.7
     assert np.abs(aided_m).max() < 0.5 * np.abs(unaided_m).max()
+
+
+def climbing(t_s: float) -> Array:
+    """Place in NED, metres: 3 m/s up."""
+    return np.array([0.0, 0.0, -20.0 - 3.0 * t_s])
+
+
+def test_a_barometer_that_appears_in_the_air_tells_of_the_climb_alone() -> None:
+    """Its zero is that of the height at its own time, and as uncertain as this."""
+    flown, unaided = Flown(climbing, 2, 8.0), Flown(climbing, 2, 8.0)
+    for t_s in np.arange(AIDED_S + 5.0, AIDED_S + 6.0, 0.2).tolist():
+        height_m = 300.0 - climbing(t_s)[2]
+        flown.navigation.aid(AidedHeight(round(t_s * 1e9), height_m))
+    (place, _, sigma_m, _), (without, _, sigma_without_m, _) = (
+        each.error(AIDED_S + 6.0) for each in (flown, unaided)
+    )
+    assert flown.navigation.n_refused == {}
+    assert np.abs(place - without).max() < 0.1, "nothing is known yet of where it is"
+    assert sigma_m > 0.95 * sigma_without_m
