@@ -20,7 +20,8 @@ import msgspec
 
 from companion.config import ADDRESS, EXPERT, Config
 from companion.config.computer_settings import NO_PROFILE, profile_text
-from companion.config.keys import (
+from companion.config.passwords import with_passwords_hidden
+from companion.config.setting_keys import (
     dump,
     kind_of,
     listed_words_of,
@@ -29,7 +30,6 @@ from companion.config.keys import (
     with_values,
     words_of,
 )
-from companion.config.passwords import with_passwords_hidden
 from companion.errors import ConfigError
 
 if sys.version_info >= (3, 11):

@@ -24,7 +24,7 @@ from drivers.recording.recorded_flight import (
     open_recorded_folder,
     open_recording,
 )
-from drivers.telemetry.telemetry_folder import READERS as LOGS
+from drivers.telemetry.log_readers import READERS as LOGS
 
 
 class Format(NamedTuple):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.config import Config
-from companion.config.keys import dump, with_values
+from companion.config.setting_keys import dump, with_values
 
 HIDDEN = "***"
 """Text in place of a password."""

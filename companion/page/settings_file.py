@@ -10,8 +10,8 @@ from typing import Any
 
 import tomlkit
 
-from companion.config.keys import dump, value_of_key
 from companion.config.passwords import without_passwords
+from companion.config.setting_keys import dump, value_of_key
 from companion.config_file import config_of_text, load_config, toml_value, values_in, values_of
 from companion.errors import ConfigError
 from companion.products.atomic_file import write_atomically

@@ -35,8 +35,8 @@ from companion.messages import (
 from companion.runtime.mailbox import DropPolicy
 from companion.telemetry import TELEMETRY, PositionSample
 
-CURVES = tuple(kind for kind in TELEMETRY if kind.schema.curve)
-"""Telemetry of which viewers show a curve."""
+PLOTTED = tuple(kind for kind in TELEMETRY if kind.schema.curve)
+"""Telemetry of which viewers plot a curve."""
 
 
 class Frames(Enum):
@@ -115,7 +115,7 @@ STAGES = (
     Stage(
         "viewers",
         (
-            Frame, PositionSample, *CURVES, Warned, Health, GeoOrigin, Odometry, Track,
+            Frame, PositionSample, *PLOTTED, Warned, Health, GeoOrigin, Odometry, Track,
             KeyframeAdded, MapUpdate, DepthMap, PointChunk, ObstaclesSeen,
         ),
         nice=10, frames=Frames.EVERY, answer_s=30.0, finish_s=6.0, with_flight=True,

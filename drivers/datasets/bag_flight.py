@@ -27,7 +27,7 @@ from drivers.datasets.bag_samples import (
 )
 from drivers.datasets.flight_folder import camera_of
 from drivers.flight import Flight
-from drivers.telemetry.telemetry_folder import aligned, unchanged
+from drivers.telemetry.log_readers import aligned, unchanged
 from drivers.telemetry.telemetry_log import GeodeticFix, LogContent, TelemetryCollector
 
 PICTURES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")

@@ -30,8 +30,8 @@ from drivers.images.listed_images import listed_images
 from drivers.images.picture_file import read_grey
 from drivers.images.stereo_pair import Depths, StereoPair
 from drivers.images.text_table import ns_of_whole, numbers_of, pose_of, read_rows
+from drivers.telemetry.log_readers import aligned, unchanged
 from drivers.telemetry.measured_depths import with_depths
-from drivers.telemetry.telemetry_folder import aligned, unchanged
 from drivers.telemetry.telemetry_log import LogContent, Pictures, TelemetryCollector, TelemetryLog
 
 MAX_YAML_BYTES = 100_000

@@ -20,7 +20,7 @@ from drivers.images.frame_source import (
     find_frames,
 )
 from drivers.images.frame_times import read_frame_times
-from drivers.telemetry.telemetry_folder import logs_asked_for, logs_in, read_telemetry
+from drivers.telemetry.log_readers import logs_asked_for, logs_in, read_telemetry
 from drivers.telemetry.telemetry_log import Pictures, TelemetryLog
 from drivers.telemetry.telemetry_srt import srt_camera
 from drivers.telemetry.video_alignment import read_unaligned

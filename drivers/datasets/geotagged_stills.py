@@ -21,7 +21,7 @@ from drivers.flight import Flight
 from drivers.images.calibration_file import FORWARD_UPRIGHT, read_calibration
 from drivers.images.exif import Photo, read_photo
 from drivers.images.frame_source import VIDEO_SUFFIXES, ImageFolder
-from drivers.telemetry.telemetry_folder import aligned, unchanged
+from drivers.telemetry.log_readers import aligned, unchanged
 from drivers.telemetry.telemetry_log import GeodeticFix, LogContent, TelemetryCollector
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".tif", ".tiff"})

@@ -8,7 +8,7 @@ from companion.config import CameraConfig, TelemetryConfig
 from drivers.datasets.flight_folder import camera_of, own_times
 from drivers.flight import Flight
 from drivers.images.frame_source import VIDEO_SUFFIXES, Video
-from drivers.telemetry.telemetry_folder import logs_asked_for, logs_beside
+from drivers.telemetry.log_readers import logs_asked_for, logs_beside
 from drivers.telemetry.video_alignment import read_unaligned
 
 

@@ -23,7 +23,7 @@ from companion.timing.image_rotation import RotationMeter
 from companion.timing.rotation_alignment import RotationRecord, TimeAlignment, align_rotations
 from drivers.telemetry.gpmf_gyro import gyro_rotation
 from drivers.telemetry.gpmf_track import blocks_of
-from drivers.telemetry.telemetry_folder import aligned, read_log_file, read_telemetry
+from drivers.telemetry.log_readers import aligned, read_log_file, read_telemetry
 from drivers.telemetry.telemetry_log import Pictures, TelemetryLog
 
 MAX_FRAMES = 6000

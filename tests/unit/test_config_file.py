@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from companion.config import MEASUREMENTS, Config
-from companion.config.keys import dump, value_of_key
 from companion.config.passwords import command_shown, with_passwords_hidden, without_passwords
+from companion.config.setting_keys import dump, value_of_key
 from companion.config_file import current_key, load_config, shown, to_toml, values_in
 from companion.errors import ConfigError
 from companion.page.setting_texts import settings

@@ -10,7 +10,7 @@ import pytest
 from companion.app.status_command import status_table
 from companion.config import Config
 from companion.config.computer_settings import NO_PROFILE, profile_text
-from companion.config.keys import dump, value_of_key, words_of
+from companion.config.setting_keys import dump, value_of_key, words_of
 from companion.config_file import config_of_text, load_config, of_profile, values_of
 from companion.errors import ConfigError
 from tests.unit.app.test_cli import companion, refused

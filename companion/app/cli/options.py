@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.app.stopping import StopSignals
-from companion.config.keys import words_of
+from companion.config.setting_keys import words_of
 from companion.errors import InputError
 
 PROFILE = "computer.profile"

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.config import Config
-from companion.config.keys import value_of_key, with_values
+from companion.config.setting_keys import value_of_key, with_values
 from companion.config_file import current_key, with_value
 from companion.daemon.control.tightening import WHILE_ARMED, tightened
 from companion.errors import ConfigError

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from companion.config import Config
-from companion.config.keys import value_of_key, words_of
+from companion.config.setting_keys import value_of_key, words_of
 from companion.errors import ConfigError
 
 DIGITS = 7

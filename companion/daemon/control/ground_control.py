@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from companion.config import Config
-from companion.config.keys import value_of_key
+from companion.config.setting_keys import value_of_key
 from companion.daemon.control import kept_settings
 from companion.daemon.control.armed_settings import NOT_KEPT
 from companion.daemon.control.flight_parameters import (

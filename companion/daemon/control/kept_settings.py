@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.config import Config
-from companion.config.keys import dump
+from companion.config.setting_keys import dump
 from companion.config_file import changed_by, toml_value, with_value
 from companion.daemon.control.flight_parameters import PARAMETERS, FlightParameter
 from companion.errors import ConfigError

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from companion.config import Config
-from companion.config.keys import dump, with_values
+from companion.config.setting_keys import dump, with_values
 
 FIXED_SECTIONS = frozenset({
     "camera", "mount", "link", "router", "page", "video", "distributed", "landing", "gps",

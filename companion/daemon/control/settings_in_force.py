@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.config import Config
-from companion.config.keys import value_of_key, with_values
+from companion.config.setting_keys import value_of_key, with_values
 from companion.daemon.control.armed_settings import FILE, Resumed, read_settings
 from companion.daemon.control.arming import Arming
 from companion.daemon.control.kept_settings import kept_over

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from companion.config import Config
-from companion.config.keys import value_of_key, with_values
+from companion.config.setting_keys import value_of_key, with_values
 
 MayChange = Callable[[Any, Any], bool]
 """Rule of a key: (present value, wanted value) -> True if it may change while armed."""

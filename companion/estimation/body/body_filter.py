@@ -59,7 +59,7 @@ MAX_HELD_NS = 400_000_000
 and so late a measurement may come."""
 LEAST_MOVE = 1e-12
 """Of a frame, metres and radians: less is rounding."""
-REFUSED = {1: 10.83, 2: 13.82, 3: 16.27}
+CHI_SQUARE_LIMIT = {1: 10.83, 2: 13.82, 3: 16.27}
 """Chi-square that is exceeded once in a thousand times, by degrees of freedom."""
 NORMALISED_TAU = 30
 """Places, two seconds of them."""
@@ -287,7 +287,7 @@ class BodyFilter:
             self._n_refused[model.kind.value] += 1
         if isinstance(measured, AidedPlace):
             # a refused one shows that it does not fit, not by how much those that fit are off
-            squared = min(squared, REFUSED[3])
+            squared = min(squared, CHI_SQUARE_LIMIT[3])
             self._normalised += (squared / 3.0 - self._normalised) / NORMALISED_TAU
             self._judge(measured, refused=corrected is None)
         if isinstance(measured, AidedRest):
@@ -300,7 +300,7 @@ class BodyFilter:
         gained = seen @ spread
         expected = gained @ seen.T + model.covariance
         squared = float(innovation @ np.linalg.solve(expected, innovation))
-        if squared > REFUSED[len(seen)]:
+        if squared > CHI_SQUARE_LIMIT[len(seen)]:
             return None, squared
         gain = np.linalg.solve(expected, gained).T
         gain[[*model.considered, SCALE]] = 0.0

@@ -9,7 +9,7 @@ from companion.estimation.body.reckoning import Reckoning
 from companion.estimation.camera_motion import SIGMA_DEAD_RECKONING_M_S
 from companion.estimation.georeference.trajectory_alignment import SIGMA_YAW_RAD
 from companion.estimation.odometry.flown_map import FlownMap, LastPose
-from companion.estimation.odometry.innovation_gate import InnovationGate
+from companion.estimation.odometry.jump_gate import JumpGate
 from companion.estimation.odometry.odometry_drift import ALONG_ONE, OdometryDrift
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Georeference, Odometry, Track, TrackState
@@ -28,7 +28,7 @@ class OdometryCourse:
 
     def __init__(self, camera_from_body: Pose, max_jump_m: float, body: BodyFilter) -> None:
         self.flown = FlownMap(camera_from_body)
-        self.gate = InnovationGate(max_jump_m)
+        self.gate = JumpGate(max_jump_m)
         self.drift = OdometryDrift()
         self.body = body
         self.reckoning = Reckoning(body)

@@ -15,7 +15,7 @@ from companion.estimation.body.reckoning import BodyAttitude
 from companion.estimation.camera_motion import ImageVelocity
 from companion.estimation.lift_off.ground_aiding import GroundAiding
 from companion.estimation.odometry.flown_map import LastPose
-from companion.estimation.odometry.innovation_gate import MIN_CONSISTENT_NS
+from companion.estimation.odometry.jump_gate import MIN_CONSISTENT_NS
 from companion.estimation.odometry.lift_off_heading import LiftOffHeading
 from companion.estimation.odometry.map_starts import MapStarts
 from companion.estimation.odometry.odometry_course import (

@@ -11,7 +11,7 @@ from enum import Enum
 
 import numpy as np
 
-from companion.estimation.odometry.innovation_gate import MAX_ACCELERATION_M_S2
+from companion.estimation.odometry.jump_gate import MAX_ACCELERATION_M_S2
 from companion.estimation.resumption.checkpoint import Checkpoint
 from companion.geometry.transforms import Array, Pose, angle_between
 from companion.messages import Track

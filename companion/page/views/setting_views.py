@@ -12,8 +12,8 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from companion.config import Config
-from companion.config.keys import dump, listed_words_of, value_of_key, words_of
 from companion.config.passwords import HIDDEN, without_passwords
+from companion.config.setting_keys import dump, listed_words_of, value_of_key, words_of
 from companion.daemon.control.reload import needs_restart
 from companion.errors import ConfigError
 from companion.page.setting_texts import PURPOSES, Setting, settings

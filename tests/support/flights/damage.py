@@ -17,7 +17,7 @@ from companion.config import CameraConfig, TelemetryConfig
 from companion.errors import InputError
 from companion.messages import Frame, Warned
 from drivers.open_flight import open_flight
-from drivers.telemetry.telemetry_folder import READERS, aligned, read_log_file
+from drivers.telemetry.log_readers import READERS, aligned, read_log_file
 from drivers.telemetry.telemetry_log import Pictures
 
 

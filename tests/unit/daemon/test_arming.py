@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from companion.config import Config, FeedbackConfig
-from companion.config.keys import with_values
+from companion.config.setting_keys import with_values
 from companion.daemon.control import armed_settings, arming
 from companion.daemon.control.armed_settings import FILE, read_settings
 from companion.daemon.control.arming import CERTAIN_S, Arming

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from companion.config import Config, ControlConfig, DistributedConfig, FeedbackConfig, LinkConfig
-from companion.config.keys import value_of_key
+from companion.config.setting_keys import value_of_key
 from companion.config_file import to_toml
 from companion.daemon.component_state import (
     ACTIVE,

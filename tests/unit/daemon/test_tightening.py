@@ -15,7 +15,7 @@ from companion.config import (
     TelemetryConfig,
     TrackingConfig,
 )
-from companion.config.keys import value_of_key, with_values
+from companion.config.setting_keys import value_of_key, with_values
 from companion.daemon.control.flight_parameters import PARAMETERS
 from companion.daemon.control.reload import reloaded
 from companion.daemon.control.tightening import WHILE_ARMED, may_change, tightened

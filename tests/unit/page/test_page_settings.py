@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from companion.config import Config
-from companion.config.keys import dump
+from companion.config.setting_keys import dump
 from companion.config_file import load_config
 from companion.errors import ConfigError
 from companion.page.setting_texts import settings

@@ -7,7 +7,7 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 from companion.estimation.body.aiding import AidedPlace, AidedRest
-from companion.estimation.body.body_filter import NORMALISED_TAU, REFUSED, BodyFilter
+from companion.estimation.body.body_filter import CHI_SQUARE_LIMIT, NORMALISED_TAU, BodyFilter
 from companion.estimation.body.body_state import UNMEASURED_M_S2
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_motion import SIGMA_SPEED_M_S
@@ -38,9 +38,9 @@ def take(found: KalmanFilter, measured: Array, part: int, sigma: float) -> float
     spread = seen @ found.P @ seen.T + sigma**2 * np.eye(3)
     innovation = measured - seen @ found.x
     squared = float(innovation @ np.linalg.solve(spread, innovation))
-    if squared <= REFUSED[3]:
+    if squared <= CHI_SQUARE_LIMIT[3]:
         found.update(measured, R=sigma**2 * np.eye(3), H=seen)
-    return min(squared, REFUSED[3])
+    return min(squared, CHI_SQUARE_LIMIT[3])
 
 
 def test_it_is_the_kalman_filter_of_its_model(rng: np.random.Generator) -> None:

@@ -1,4 +1,4 @@
-"""Innovation gate of the smooth odometry: whether motion can have brought the body here."""
+"""Jump gate of the smooth odometry: whether motion can have brought the body here."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class _Refused(NamedTuple):
     n: int
 
 
-class InnovationGate:
+class JumpGate:
     """Accepts positions (3,), world, metres, that differ by less than `max_jump_m` from motion."""
 
     def __init__(self, max_jump_m: float) -> None:
