@@ -92,6 +92,5 @@ class _Depth(Work):
             self._tell(DriverAtWork())
 
 
-def work(setup: Setup) -> Work:
-    """The stage for a setup."""
-    return _Depth(setup)
+work = _Depth
+"""The stage for a setup."""

@@ -29,6 +29,5 @@ class _Landing(Work):
         return []
 
 
-def work(setup: Setup) -> Work:
-    """The stage for a setup."""
-    return _Landing(setup)
+work = _Landing
+"""The stage for a setup."""

@@ -197,6 +197,5 @@ class _Localisation(Work):
             keeper.put(checkpoint)
 
 
-def work(setup: Setup) -> Work:
-    """The stage for a setup."""
-    return _Localisation(setup)
+work = _Localisation
+"""The stage for a setup."""

@@ -42,6 +42,5 @@ class _Recorder(Work):
         return self._recorder.warnings()
 
 
-def work(setup: Setup) -> Work:
-    """The stage for a setup."""
-    return _Recorder(setup)
+work = _Recorder
+"""The stage for a setup."""

@@ -97,6 +97,5 @@ def kept(chunk: PointChunk) -> PointChunk:
     )  # fmt: skip
 
 
-def work(setup: Setup) -> Work:
-    """The stage for a setup."""
-    return _Results(setup)
+work = _Results
+"""The stage for a setup."""

@@ -194,6 +194,5 @@ class Topics(Work):
             yield Warned(t_ns, MALFORMED, f"{self._n_malformed} so far")
 
 
-def work(setup: Setup) -> Work:
-    """The stage for a setup."""
-    return Topics(setup)
+work = Topics
+"""The stage for a setup."""

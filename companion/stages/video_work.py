@@ -81,6 +81,5 @@ class _Video(Work):
         return []
 
 
-def work(setup: Setup) -> Work:
-    """The stage for a setup."""
-    return _Video(setup)
+work = _Video
+"""The stage for a setup."""

@@ -99,6 +99,5 @@ class _Viewers(Work):
                 return
 
 
-def work(setup: Setup) -> Work:
-    """The stage for a setup."""
-    return _Viewers(setup)
+work = _Viewers
+"""The stage for a setup."""

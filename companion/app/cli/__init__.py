@@ -69,7 +69,10 @@ def _run(argv: Sequence[str] | None) -> int:
     arguments = command_parser().parse_args(argv)
     with StopSignals() as signals:
         try:
-            return int(arguments.does(arguments, signals))
+            status: int | None = arguments.does(arguments, signals)
+            if status is None:
+                signals.take()
+            return status or 0
         except KeyboardInterrupt:
             print("companion: stopped", file=sys.stderr)
             return signals.exit_status

@@ -47,7 +47,7 @@ def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
         return run(load, server.start, SettingsSource(arguments.config, tuple(arguments.set)))
 
 
-def _status(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _status(arguments: argparse.Namespace, signals: StopSignals) -> None:
     from companion.app.status_command import show_status
     from drivers.system.status_socket import found_socket_path
 
@@ -56,14 +56,12 @@ def _status(arguments: argparse.Namespace, signals: StopSignals) -> int:
         found_socket_path(setting), sys.stdout, as_json=arguments.json, watch=arguments.watch,
         stop=threading.Event(),
     )  # fmt: skip
-    return 0
 
 
-def _page(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _page(arguments: argparse.Namespace, signals: StopSignals) -> None:
     from companion.app.page_command import show_page
 
     show_page(load_config(arguments.config, arguments.set), sys.stdout, arguments.new_codes)
-    return 0
 
 
 def _view(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -76,7 +74,7 @@ def _view(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return view(arguments.host, where, arguments.bind, arguments.colours, notify)
 
 
-def _support(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _support(arguments: argparse.Namespace, signals: StopSignals) -> None:
     from companion.app.support_command import support
     from companion.service.flights_meant import flights_meant, installed_services
 
@@ -85,21 +83,19 @@ def _support(arguments: argparse.Namespace, signals: StopSignals) -> int:
         flights = flights_meant(arguments.config, arguments.set, installed_services())
     config = load_config(arguments.config, arguments.set)
     support(config, flights, arguments.out, arguments.seconds, print)
-    return 0
 
 
-def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> None:
     if not arguments.migrate:
         config = load_config(arguments.config, arguments.set)
         _check_beyond(config)
         print(to_toml(config), end="")
-        return 0
+        return
     from companion.app.migrate_command import migrate
 
     if arguments.config is None or arguments.set:
         raise InputError("--migrate wants --config FILE, and no --set")
     migrate(arguments.config, sys.stdout)
-    return 0
 
 
 def _check_beyond(config: Config) -> None:

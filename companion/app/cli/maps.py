@@ -15,7 +15,7 @@ MAP = "a site map, or the folder of a run"
 NEW_MAP = "a new site map"
 
 
-def _map(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _map(arguments: argparse.Namespace, signals: StopSignals) -> int | None:
     """Show, verify, export, merge, prune or save; 1 where a map is damaged."""
     from companion.app.maps import map_command as maps
 
@@ -41,8 +41,7 @@ def _map(arguments: argparse.Namespace, signals: StopSignals) -> int:
         for each in maps.save(arguments.map, arguments.out).damaged:
             print(f"companion: {arguments.map}: {each} is damaged, and left out", file=sys.stderr)
         print(arguments.out)
-    signals.take()
-    return 0
+    return None
 
 
 def add_parsers(commands: Any) -> None:

@@ -19,7 +19,7 @@ from companion.app.stopping import StopSignals
 from companion.config_file import load_config
 
 
-def _depth(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _depth(arguments: argparse.Namespace, signals: StopSignals) -> None:
     from companion.app.depth_command import Wanted, reconstruct
 
     sets = list(arguments.set)
@@ -33,8 +33,6 @@ def _depth(arguments: argparse.Namespace, signals: StopSignals) -> int:
     )  # fmt: skip
     plural = "" if len(maps) == 1 else "s"
     print(f"{len(maps)} depth map{plural} and cloud.ply: {arguments.out}")
-    signals.take()
-    return 0
 
 
 def add_parsers(commands: Any) -> None:

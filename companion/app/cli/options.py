@@ -17,8 +17,8 @@ from companion.config.setting_keys import words_of
 from companion.errors import InputError
 
 PROFILE = "computer.profile"
-Command = Callable[[argparse.Namespace, StopSignals], int]
-"""Implementation of a command: arguments in, exit status out."""
+Command = Callable[[argparse.Namespace, StopSignals], int | None]
+"""Implementation of a command: arguments in, exit status out; None for 0, unless a stop came."""
 
 
 def command(commands: Any, name: str, does: Command, **options: Any) -> argparse.ArgumentParser:

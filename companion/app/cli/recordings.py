@@ -25,7 +25,7 @@ from companion.config_file import load_config
 from companion.errors import InputError
 
 
-def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int | None:
     """List, show, trim, export, verify, repair or prune; or make a mission of one."""
     from companion.app import flights_command as flights
     from companion.service.flights_meant import flights_meant, installed_services
@@ -72,8 +72,7 @@ def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
                 free_mb=arguments.free, dry_run=arguments.dry_run,
             )
         )  # fmt: skip
-    signals.take()
-    return 0
+    return None
 
 
 def _repair(paths: Sequence[Path], gently: bool, progress: Progress) -> int:

@@ -42,7 +42,7 @@ def _with_telemetry(arguments: argparse.Namespace) -> Config:
     return dataclasses.replace(config, telemetry=telemetry)
 
 
-def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _replay(arguments: argparse.Namespace, signals: StopSignals) -> None:
     config = _with_telemetry(arguments)
     if arguments.map is not None:
         config = dataclasses.replace(config, map=MapConfig(use=str(arguments.map)))
@@ -65,8 +65,7 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
         with held_folder(arguments.out):
             replay_as_flown(arguments.flight, arguments.out, config, progress, print)
-        signals.take()
-        return 0
+        return
     with garbage_collection_paused():
         from companion.app.replay.replay_command import RecordedInput, replay
         from companion.telemetry import belief_in_words
@@ -86,20 +85,18 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         if config.export.formats:
             _export_into(arguments.out, arguments.out, config, arguments.flight)
     print(f"report: {arguments.out / 'report.html'}")
-    signals.take()
-    return 0
 
 
-def _demo(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _demo(arguments: argparse.Namespace, signals: StopSignals) -> None:
     """The sample flight, as any other is replayed."""
     from companion.app.sample_flight import sample_flight
 
     arguments.flight = arguments.flight or sample_flight()
     print(f"flight: {arguments.flight}", flush=True)
-    return _replay(arguments, signals)
+    _replay(arguments, signals)
 
 
-def _import(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _import(arguments: argparse.Namespace, signals: StopSignals) -> None:
     from companion.app.import_command import import_flight
 
     n = import_flight(
@@ -107,11 +104,9 @@ def _import(arguments: argparse.Namespace, signals: StopSignals) -> int:
         signals.between_frames(progress_on(sys.stderr, "images")), print,
     )  # fmt: skip
     print(f"flight: {arguments.out}, {n} frames")
-    signals.take()
-    return 0
 
 
-def _export(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _export(arguments: argparse.Namespace, signals: StopSignals) -> None:
     config = load_config(arguments.config, arguments.set)
     if arguments.formats is not None:
         export = dataclasses.replace(config.export, formats=names(arguments.formats.lower()))
@@ -119,10 +114,9 @@ def _export(arguments: argparse.Namespace, signals: StopSignals) -> int:
     if not config.export.formats:
         raise InputError("nothing to export: --as las,gpx,… says what")
     _export_into(arguments.run, arguments.out or arguments.run, config, arguments.flight)
-    return 0
 
 
-def _film(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _film(arguments: argparse.Namespace, signals: StopSignals) -> None:
     from companion.app.film_command import film
     from companion.products.film.flight_film import FilmSize
 
@@ -132,8 +126,6 @@ def _film(arguments: argparse.Namespace, signals: StopSignals) -> int:
     config = load_config(arguments.config, arguments.set)
     n = film(arguments.run, arguments.flight, arguments.out, size, config, progress)
     print(f"film: {arguments.out}, {n} frames")
-    signals.take()
-    return 0
 
 
 def _export_into(run: Path, out: Path, config: Config, flight: Path | None) -> None:

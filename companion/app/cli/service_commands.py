@@ -10,21 +10,19 @@ from companion.app.cli.options import command
 from companion.app.stopping import StopSignals
 
 
-def _install(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _install(arguments: argparse.Namespace, signals: StopSignals) -> None:
     from companion.service.install import install
 
     install(
         arguments.config, _notify, user=arguments.user, venv=arguments.venv, now=arguments.now,
         dry_run=arguments.dry_run,
     )  # fmt: skip
-    return 0
 
 
-def _uninstall(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _uninstall(arguments: argparse.Namespace, signals: StopSignals) -> None:
     from companion.service.install import uninstall
 
     uninstall(_notify, user=arguments.user, purge=arguments.purge, dry_run=arguments.dry_run)
-    return 0
 
 
 def _notify(text: str) -> None:
