@@ -13,7 +13,7 @@ from drivers.datasets.euroc import is_euroc, open_euroc
 from drivers.datasets.flight_folder import has_pictures, is_flight_folder, open_flight_folder
 from drivers.datasets.geotagged_stills import is_geotagged, open_geotagged
 from drivers.datasets.kitti import is_kitti, open_kitti
-from drivers.datasets.posed_flight import is_posed_folder, open_posed_flight
+from drivers.datasets.posed_folders import is_posed_folder, open_posed_folder
 from drivers.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from drivers.datasets.video_flight import is_video, open_video
 from drivers.flight import Flight
@@ -47,7 +47,7 @@ FOLDERS = (
     Format("EuRoC (ASL)", is_euroc, open_euroc),
     Format("KITTI odometry", is_kitti, open_kitti),
     Format("TUM RGB-D", is_tum_rgbd, open_tum_rgbd),
-    Format("images with poses", is_posed_folder, open_posed_flight),
+    Format("images with poses", is_posed_folder, open_posed_folder),
     Format("ROS bag", is_bag, open_bag),
     Format("geotagged photographs", is_geotagged, open_geotagged),
     Format("video or images", has_pictures, open_flight_folder),

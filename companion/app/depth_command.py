@@ -26,8 +26,8 @@ from companion.messages import Bytes, DepthMap, MapUpdate, PixelState, PointChun
 from companion.products.depth_files import write_cloud, write_depth
 from companion.products.depth_log import ReferenceLog, Spent, UpdateLog, write_log
 from companion.timing.clock import StageTimes
-from drivers.datasets.posed_images import PosedImages
-from drivers.datasets.posed_layouts import open_posed_images
+from drivers.open_flight import format_of
+from drivers.posed_images import PosedImages, open_posed_images
 
 MAX_TURN_RAD = np.radians(35.0)
 RANGE_FRAMES = 60
@@ -206,7 +206,7 @@ def reconstruct(
     chunks += [chunk_alone(done[0])] if single else fusion.flush(update)
     write_cloud(out, chunks, places)
     write_log(
-        out, device=device.described, layout=images.layout, maps=done,
+        out, device=device.described, layout=format_of(path).name, maps=done,
         log=work.log, stages=work.times.summary(),
     )  # fmt: skip
     return done

@@ -14,7 +14,6 @@ import numpy as np
 from companion.config import CameraConfig, TelemetryConfig
 from companion.geometry.camera import Camera, Distortion
 from companion.messages import Bytes, Floats, Warned
-from drivers.datasets.posed_layouts import TUM_CAMERA, TUM_CAMERAS
 from drivers.flight import Flight, TruePose
 from drivers.images.calibration_file import read_calibration
 from drivers.images.listed_images import listed_images
@@ -24,6 +23,12 @@ from drivers.images.text_table import ns_of_seconds, numbers_of, pose_of, read_r
 from drivers.telemetry.measured_depths import with_depths
 from drivers.telemetry.telemetry_log import Pictures, TelemetryLog, no_telemetry
 
+TUM_CAMERAS = {
+    "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6, (0.0, 0.0, 0.0, 0.0, 0.0)),
+}
+TUM_CAMERA = (525.0, 525.0, 319.5, 239.5, (0.0, 0.0, 0.0, 0.0, 0.0))
 SIGMA_AT_1_M = 1.425e-3
 """Grows with the square of the depth (Khoshelham and Elberink 2012, of the first Kinect)."""
 MAX_SPREAD_RATIO = 0.05
@@ -92,8 +97,11 @@ def _usual_camera(path: Path, width: int, height: int) -> tuple[Camera, str]:
 
 def _truth(path: Path) -> list[TruePose]:
     listing = path / "groundtruth.txt"
-    if not listing.is_file():
-        return []
+    return tum_poses(listing) if listing.is_file() else []
+
+
+def tum_poses(listing: Path) -> list[TruePose]:
+    """Poses of a file in the benchmark's format; FlightError if invalid."""
     out = []
     for t, *words in read_rows(listing, 8):
         x, y, z, qx, qy, qz, qw = numbers_of(listing, words[:7])

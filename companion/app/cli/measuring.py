@@ -40,9 +40,8 @@ def add_parsers(commands: Any) -> None:
     depth = command(
         commands, "depth", _depth, parents=[configuration()],
         help="dense depth from images with known poses",
-        description="Reconstruct the depth of reference frames. DATASET is a folder in the layout "
-        "of REMODE's test set or of TUM RGB-D, with poses.txt and K.txt, or a flight with "
-        "trajectory.tum.",
+        description="Reconstruct the depth of reference frames. DATASET is a flight's folder with "
+        "trajectory.tum in it, or a data set with ground truth.",
     )  # fmt: skip
     depth.add_argument("dataset", type=Path, metavar="DATASET", help="its folder")
     depth.add_argument(

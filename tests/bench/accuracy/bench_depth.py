@@ -25,8 +25,7 @@ from companion.errors import FlightError
 from companion.geometry.transforms import Pose
 from companion.messages import Bytes, DepthMap, Floats, PixelState
 from companion.timing.clock import StageTimes
-from drivers.datasets.posed_images import PosedImages
-from drivers.datasets.posed_layouts import open_posed_images
+from drivers.posed_images import PosedImages, open_posed_images
 from tests.bench.accuracy.depth_accuracy import Accuracy, accuracy
 from tests.bench.accuracy.depth_results import (
     AfterFrames,
@@ -38,6 +37,7 @@ from tests.bench.accuracy.depth_results import (
 )
 from tests.bench.accuracy.depth_tables import write_bench
 from tests.bench.accuracy.remode_serial import RemodeSerial
+from tests.bench.accuracy.true_depths import true_depth
 
 CHECKPOINTS = (1, 5, 10, 15, 20, 25, 30, 40, 50, 75, 100, 150, 200, 300, 400)
 THRESHOLDS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
@@ -124,7 +124,7 @@ def _as_used(
     before: dict[int, tuple[Accuracy, Accuracy]] = {}
 
     def look(depth_map: DepthMap) -> None:
-        truth = images.truth(images.numbers.index(depth_map.keyframe_id))
+        truth = true_depth(images, images.numbers.index(depth_map.keyframe_id))
         if truth is not None:
             truths[depth_map.keyframe_id] = prepared.nearest(truth)
             before[depth_map.keyframe_id] = _judged(depth_map, truths[depth_map.keyframe_id])
@@ -156,7 +156,7 @@ def _judged(depth_map: DepthMap, truth: Floats) -> tuple[Accuracy, Accuracy]:
 
 def _scene(images: PosedImages, reference: int, frames: tuple[int | None, int | None]) -> _Scene:
     at = images.position(reference)
-    truth, pose = images.truth(at), images.poses[at]
+    truth, pose = true_depth(images, at), images.poses[at]
     if truth is None or pose is None:
         raise FlightError(f"{images.path}: frame {reference} has no true depth")
     first = 0 if frames[0] is None else frames[0]

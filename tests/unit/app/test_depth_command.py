@@ -22,8 +22,9 @@ from companion.geometry.transforms import (
     rotation_from_vector,
 )
 from companion.messages import Bytes, Floats
-from drivers.datasets.posed_layouts import open_posed_images
+from drivers.posed_images import open_posed_images
 from tests.bench.accuracy.__main__ import main as bench_main
+from tests.bench.accuracy.true_depths import true_depth
 from tests.support.flights.scene import DOWN_LOOKING, PlaneWorld
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
@@ -83,7 +84,7 @@ def write_tum(folder: Path, rendered: list[tuple[Bytes, Floats]]) -> None:
         rgb.append(f"{t:.4f} rgb/{t:.4f}.png")
         depths.append(f"{t + 0.004:.4f} depth/{t:.4f}.png")
         x, y, z = at(k).translation
-        poses.append(f"{t - 0.003:.4f} {x} {y} {z} {_wxyz_to_xyzw(at(k).rotation)}")
+        poses.append(f"{t:.4f} {x} {y} {z} {_wxyz_to_xyzw(at(k).rotation)}")
     for name, lines in (("rgb", rgb), ("depth", depths), ("groundtruth", poses)):
         (folder / f"{name}.txt").write_text("\n".join(lines))
     _camera_json(folder)
@@ -130,7 +131,7 @@ def test_layouts_are_read(
     LAYOUTS[layout](tmp_path / "set", rendered)
     images = open_posed_images(tmp_path / "set")
     scale = 0.1 if layout == "REMODE" else 1.0
-    assert images.layout == layout and len(images) == N
+    assert len(images) == N
     assert images.camera.fx == CAMERA.fx
     for k, pose in enumerate(images.poses):
         assert pose is not None
@@ -140,7 +141,7 @@ def test_layouts_are_read(
         want, found = at(0).inverse() @ at(k), first.inverse() @ pose
         np.testing.assert_allclose(found.rotation, want.rotation, atol=1e-6)
         np.testing.assert_allclose(found.translation, scale * want.translation, atol=1e-6)
-    truth = images.truth(3)
+    truth = true_depth(images, 3)
     assert truth is not None
     known = truth > 0
     assert known.mean() > 0.5
@@ -150,11 +151,38 @@ def test_layouts_are_read(
     np.testing.assert_array_equal(pictures[1][..., 1], rendered[5][0])
 
 
-def test_folders_that_are_none_of_these_are_named(tmp_path: Path) -> None:
-    with pytest.raises(FlightError, match="no such folder"):
+def test_folders_that_are_none_of_these_are_named(
+    rendered: list[tuple[Bytes, Floats]], tmp_path: Path
+) -> None:
+    with pytest.raises(FlightError, match="no such file or folder"):
         open_posed_images(tmp_path / "none")
+    write_posed_video(tmp_path / "set", rendered)
+    (tmp_path / "set" / "poses.txt").unlink()
     with pytest.raises(FlightError, match="no images with poses"):
-        open_posed_images(tmp_path)
+        open_posed_images(tmp_path / "set")
+
+
+def test_poses_between_two_are_interpolated(
+    rendered: list[tuple[Bytes, Floats]], tmp_path: Path
+) -> None:
+    write_flight(tmp_path / "set", rendered)
+    file = tmp_path / "set" / "trajectory.tum"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join(lines[:3] + lines[4:6]))
+    poses = open_posed_images(tmp_path / "set").poses
+    assert poses[3] is not None and poses[6] is None
+    np.testing.assert_allclose(poses[3].translation, at(3).translation, atol=1e-6)
+
+
+def test_an_image_that_cannot_be_decoded_is_named(
+    rendered: list[tuple[Bytes, Floats]], tmp_path: Path
+) -> None:
+    write_posed_video(tmp_path / "set", rendered)
+    (tmp_path / "set" / "images" / "00004.png").write_bytes(b"no image")
+    images = open_posed_images(tmp_path / "set")
+    assert [at for at, _ in images.pictures([2, 3, 6])] == [2, 3, 6]
+    with pytest.raises(FlightError, match="frame 4 cannot be decoded"):
+        list(images.pictures([3, 4, 5]))
 
 
 def test_a_frame_that_is_not_there_is_told_with_those_that_are(
