@@ -8,7 +8,16 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from companion.app.cli.options import command, configuration, json_option, names, viewer, within
+from companion.app.cli.options import (
+    add_flag,
+    add_path,
+    command,
+    configuration,
+    json_option,
+    names,
+    viewer,
+    within,
+)
 from companion.app.stopping import StopSignals
 from companion.config import Config
 from companion.config_file import load_config, to_toml
@@ -128,96 +137,88 @@ def add_parsers(commands: Any) -> None:
 def _add_run(commands: Any) -> None:
     run = command(
         commands, "run", _run, parents=[configuration()],
-        help="fly: camera, autopilot, map and pose, until stopped",
-        description="The daemon on the drone. SIGTERM ends it, SIGHUP has it read its "
+        help="run the daemon on the drone, until stopped",
+        description="Run the daemon on the drone. SIGTERM ends it; SIGHUP makes it read its "
         "configuration again. With --stages depth,cloud it is a node on another machine, which "
-        "makes the map of a drone that runs --stages tracking.",
+        "makes the dense map of a drone that runs --stages tracking.",
     )  # fmt: skip
     run.add_argument(
         "--stages", type=names, metavar="LIST",
-        help="what runs here, joined with other nodes over Zenoh: tracking, or depth,cloud, or all",
+        help="stages of this node, which joins others over Zenoh: tracking; depth,cloud; or all",
     )  # fmt: skip
     run.add_argument(
         "--join", action="append", default=[], metavar="ENDPOINT",
-        help="a node to join, as tcp/HOST:7447; can be given again",
+        help="node to join, as tcp/HOST:7447; can be repeated",
     )  # fmt: skip
 
 
 def _add_status(commands: Any) -> None:
     status = command(
         commands, "status", _status, parents=[configuration(), json_option()],
-        help="ask the running daemon how it is",
+        help="show the state of the running daemon",
     )  # fmt: skip
-    status.add_argument("--watch", action="store_true", help="again every second until Ctrl-C")
+    add_flag(status, "--watch", "repeat every second, until Ctrl-C")
 
 
 def _add_support(commands: Any) -> None:
     support = command(
         commands, "support", _support, parents=[configuration()],
-        help="pack what a maintainer needs to help into one file",
-        description="Pack versions, settings without passwords, health, journal, list of "
-        "flights and the end of the newest recording into one .zip. Say what is in it, and what "
-        "that shows.",
+        help="pack what a maintainer needs into one file",
+        description="Pack versions, settings without passwords, health, journal, the list of "
+        "flights and the end of the newest recording into one .zip file, and print what the file "
+        "contains and reveals.",
     )  # fmt: skip
-    support.add_argument(
-        "--out", type=Path, default=Path("companion-support.zip"), metavar="FILE",
-        help="what to write (default: %(default)s)",
+    add_path(
+        support, "--out", "FILE", "file to write (default: %(default)s)",
+        default=Path("companion-support.zip"),
     )  # fmt: skip
-    support.add_argument(
-        "--flights", type=Path, metavar="DIR",
-        help="folder of all flights (default: as for flights)",
-    )  # fmt: skip
+    add_path(support, "--flights", "DIR", "folder of all flights (default: as for `flights`)")
     support.add_argument(
         "--seconds", type=within(0, 300), default=10.0, metavar="S",
-        help="seconds of the newest recording, with its pictures; 0 for none (default: 10)",
+        help="length of the recording's end, with its pictures; 0 leaves it out (default: 10)",
     )  # fmt: skip
 
 
 def _add_page(commands: Any) -> None:
     page = command(
         commands, "page", _page, parents=[configuration()],
-        help="show where the drone's page is, and the codes that pair a device with it",
-        description="Show where the drone's page is, which `companion run` serves at page.listen. "
-        "A browser on another machine needs one of the codes: the first to look on, the second to "
-        "change things.",
+        help="show the address and the codes of the drone's page",
+        description="Show the address of the drone's page, which `companion run` serves at "
+        "page.listen, and its two codes. A browser on another machine needs the first to look on, "
+        "the second to change things.",
     )  # fmt: skip
-    page.add_argument(
-        "--new-codes", action="store_true", help="draw other codes: every paired device is out"
-    )
+    add_flag(page, "--new-codes", "draw new codes; paired devices must pair again")
 
 
 def _add_view(commands: Any) -> None:
     view = command(
-        commands, "view", _view, help="watch a flight on the ground, over whatever link there is",
-        description="Connect to a companion that flies (its stream.listen) and show the map, the "
-        "camera and how all is, until Ctrl-C; the link may come and go.",
+        commands, "view", _view, help="show a flight on the ground, live",
+        description="Connect to a flying companion (its stream.listen) and show map, camera and "
+        "status, until Ctrl-C. A link that is lost is opened again.",
     )  # fmt: skip
     view.add_argument(
         "host", nargs="?", default="127.0.0.1", metavar="HOST[:PORT]",
-        help="the drone's address (default: %(default)s, port 9870)",
+        help="address of the drone (default: %(default)s, port 9870)",
     )  # fmt: skip
-    view.add_argument("--web", action="store_true", help="on a page for a browser, not in a window")
+    add_flag(view, "--web", "show it on a page for a browser, not in a window")
     view.add_argument(
         "--viewer", type=viewer, default="native", metavar="WHERE",
         help="native, web, or the rerun+http://… of a running viewer (default: %(default)s)",
     )  # fmt: skip
     view.add_argument(
         "--bind", default="127.0.0.1", metavar="ADDRESS",
-        help="where the page is served; 0.0.0.0 for other machines too (default: %(default)s)",
+        help="address that serves the page; 0.0.0.0 for other machines (default: %(default)s)",
     )  # fmt: skip
     view.add_argument(
         "--colours", choices=("picture", "height", "confidence"), default="picture",
-        help="what the colours of the cloud tell (default: %(default)s)",
+        help="meaning of the cloud's colours (default: %(default)s)",
     )  # fmt: skip
 
 
 def _add_check_config(commands: Any) -> None:
     check = command(
         commands, "check-config", _check_config, parents=[configuration()],
-        help="print the configuration that would be used",
-        description="Check a configuration and print the whole of it as TOML.",
+        help="check a configuration, and print all of it",
+        description="Check a configuration, and print all of it as TOML.",
     )  # fmt: skip
-    check.add_argument(
-        "--migrate", action="store_true",
-        help="write FILE anew with the keys of this version; it stays beside that as FILE.bak",
-    )  # fmt: skip
+    add_flag(check, "--migrate", "write FILE with this version's keys; FILE.bak is the old file")

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from companion.app.cli.options import command, configuration, json_option
+from companion.app.cli.options import add_flag, add_path, command, configuration, json_option
 from companion.app.progress import JsonProgress, progress_on
 from companion.app.stopping import StopSignals
 from companion.config import Config
@@ -130,80 +130,64 @@ def _add_devices(commands: Any) -> None:
     devices = command(
         commands, "devices", _devices, parents=[json_option()],
         help="list cameras, serial ports and OpenCL devices",
-        description="List what a configuration can name. OpenCL devices are tested and measured "
-        "anew, and the result is kept for opencl.device = auto.",
+        description="List the devices that a configuration can name. OpenCL devices are tested "
+        "and measured, and the result is kept for opencl.device = auto.",
     )  # fmt: skip
-    devices.add_argument(
-        "--opencl", action="store_true",
-        help="only OpenCL devices; exit status 1 where none of them works",
-    )  # fmt: skip
-    devices.add_argument(
-        "--bench", action="store_true",
-        help="only measure how fast this computer is, what it can carry, and which profile fits",
-    )  # fmt: skip
-    devices.add_argument(
-        "--verbose", action="store_true", help="with what drivers and their compilers say"
+    add_flag(devices, "--opencl", "list OpenCL devices only; exit status 1 if none works")
+    add_flag(
+        devices, "--bench", "only measure this computer's speed, and name the profile that fits"
     )
+    add_flag(devices, "--verbose", "show the messages of drivers and their compilers, too")
 
 
 def _add_calibrate(commands: Any) -> None:
     calibrate = command(
         commands, "calibrate", _calibrate, parents=[configuration(), json_option()],
-        help="calibrate a camera by a board held before it",
-        description="Find a camera's focal length, centre and distortion from views of a board; "
-        "writes OUT/NAME.toml, for camera.calibration, and a picture beside it.",
+        help="calibrate a camera with a board",
+        description="Find a camera's focal length, centre and distortion from views of a board. "
+        "Writes OUT/NAME.toml, for camera.calibration, and a picture beside it.",
     )  # fmt: skip
-    calibrate.add_argument(
-        "source", type=Path, nargs="?", metavar="VIDEO|FOLDER", help="views of the board"
-    )
-    calibrate.add_argument(
-        "--live", action="store_true", help="take the views from the configured camera, now"
-    )
-    calibrate.add_argument(
-        "--running", action="store_true", help="take them from the camera that a daemon has, now"
-    )
+    add_path(calibrate, "source", "VIDEO|FOLDER", "views of the board", nargs="?")
+    add_flag(calibrate, "--live", "take the views now, from the configured camera")
+    add_flag(calibrate, "--running", "take the views now, from the camera of the running daemon")
     calibrate.add_argument(
         "--board", default="charuco:7x5:0.04:0.03:DICT_5X5_100", metavar="BOARD",
-        help="charuco:COLUMNSxROWS:SQUARE_M:MARKER_M:DICTIONARY or chessboard:9x6:SQUARE_M, whose "
-        "numbers are those of inner corners (default: %(default)s)",
+        help="charuco:COLUMNSxROWS:SQUARE_M:MARKER_M:DICTIONARY, or chessboard:9x6:SQUARE_M with "
+        "the numbers of inner corners (default: %(default)s)",
     )  # fmt: skip
     calibrate.add_argument("--name", help="name of the camera, and of its file")
-    calibrate.add_argument(
-        "--out", type=Path, default=Path("config/cameras"), metavar="DIR",
-        help="where to write (default: %(default)s)",
+    add_path(
+        calibrate, "--out", "DIR", "folder to write into (default: %(default)s)",
+        default=Path("config/cameras"),
     )  # fmt: skip
     calibrate.add_argument(
         "--model", default="auto", choices=("auto", "radtan", "equidistant"),
-        help="distortion model (default: whichever fits views best that it was not fitted to)",
+        help="distortion model (default: the one that best fits views left out of its fit)",
     )  # fmt: skip
-    calibrate.add_argument(
-        "--print-board", type=Path, metavar="FILE", help="only write the board, .pdf or .png"
-    )
+    add_path(calibrate, "--print-board", "FILE", "only write the board to print, .pdf or .png")
 
 
 def _add_mount(commands: Any) -> None:
     mount = command(
         commands, "mount", _mount, parents=[configuration(), json_option()],
-        help="find how the camera sits on the vehicle, by turning both",
+        help="find the camera's mount from rotations of the vehicle",
         description="Compare rotations of the camera with those of the autopilot, in a recorded "
-        "flight or while the vehicle is turned by hand; prints the lines of [mount].",
+        "flight or while the vehicle is turned by hand, and print the lines of [mount].",
     )  # fmt: skip
-    mount.add_argument("flight", type=Path, nargs="?", metavar="FLIGHT", help="as for replay")
-    mount.add_argument(
-        "--running", action="store_true", help="of the running daemon, disarmed, while it is turned"
-    )
+    add_path(mount, "flight", "FLIGHT", "as for `replay`", nargs="?")
+    add_flag(mount, "--running", "use the running daemon, disarmed, while you turn the vehicle")
 
 
 def _add_doctor(commands: Any) -> None:
     doctor = command(
         commands, "doctor", _doctor, parents=[configuration(), json_option()],
-        help="find the autopilot's parameters that keep it from using the pose",
-        description="Read the autopilot's parameters over the configured link and name each that "
-        "stands in the way. Exit status 1 where there is one.",
+        help="find parameters that keep the autopilot from using the pose",
+        description="Read the autopilot's parameters over the configured link, and name each one "
+        "that keeps it from using the pose. Exit status 1 if there are any.",
     )  # fmt: skip
-    doctor.add_argument("--write", action="store_true", help="set these parameters, after asking")
+    add_flag(doctor, "--write", "set these parameters, after asking")
     doctor.add_argument(
         "--only", action="append", default=[], metavar="NAME",
-        help="with --write, set this parameter and no others; can be given again",
+        help="with --write, set this parameter and no others; can be repeated",
     )  # fmt: skip
-    doctor.add_argument("--yes", action="store_true", help="with --write, do not ask")
+    add_flag(doctor, "--yes", "with --write, do not ask")

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import Any
 
-from companion.app.cli.options import amount, command, json_option, made_folder
+from companion.app.cli.options import add_path, amount, command, json_option, made_folder
 from companion.app.stopping import StopSignals
 from companion.errors import InputError
 
@@ -47,37 +46,34 @@ def _map(arguments: argparse.Namespace, signals: StopSignals) -> int | None:
 def add_parsers(commands: Any) -> None:
     """Add the parsers of these commands."""
     of_map = command(
-        commands, "map", _map, help="maps of sites that flights have left",
-        description="Maps of sites: the site.map in the folder of a run or a flight.",
+        commands, "map", _map, help="show, check, export, merge or thin maps of sites",
+        description="Work with maps of sites: the site.map in the folder of a run or a flight.",
     )  # fmt: skip
     whats = of_map.add_subparsers(dest="what", required=True, metavar="WHAT")
     given = argparse.ArgumentParser(add_help=False)
-    given.add_argument("map", type=Path, metavar="MAP", help=MAP)
-
+    add_path(given, "map", "MAP", MAP)
     whats.add_parser(
         "show", parents=[given, json_option()],
-        help="say what one is of, and how well it is georeferenced",
+        help="show its size, its flights, and how well it is georeferenced",
     )  # fmt: skip
     verified = whats.add_parser(
-        "verify", help="check whether maps are whole; exit status 1 where one is not"
+        "verify", help="check whether maps are intact; exit status 1 if one is not"
     )
-    verified.add_argument("maps", type=Path, nargs="+", metavar="MAP", help=MAP)
+    add_path(verified, "maps", "MAP", MAP, nargs="+")
     exported = whats.add_parser(
         "export", parents=[given], help="write points.ply, keyframes.tum and map.json"
     )
-    exported.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for them")
+    add_path(exported, "--out", "DIR", "folder for them", required=True)
     merged = whats.add_parser(
-        "merge", help="make one map of those of several flights over a site, adjusted as one"
+        "merge", help="merge maps of several flights over a site, and adjust them as one"
     )
-    merged.add_argument("maps", type=Path, nargs="+", metavar="MAP", help=MAP)
-    merged.add_argument("--out", type=Path, required=True, metavar="FILE", help=NEW_MAP)
-    pruned = whats.add_parser(
-        "prune", parents=[given], help="leave out keyframes that others make redundant"
-    )
+    add_path(merged, "maps", "MAP", MAP, nargs="+")
+    add_path(merged, "--out", "FILE", NEW_MAP, required=True)
+    pruned = whats.add_parser("prune", parents=[given], help="leave out redundant keyframes")
     pruned.add_argument(
         "--within", type=amount, default=3.0, metavar="DEG",
-        help="largest angle, seen from its points, to one that stays, degrees (default: 3)",
+        help="largest angle, seen from its points, to a keyframe that stays (default: 3 degrees)",
     )  # fmt: skip
-    pruned.add_argument("--out", type=Path, required=True, metavar="FILE", help=NEW_MAP)
-    saved = whats.add_parser("save", parents=[given], help="keep the map of a run elsewhere")
-    saved.add_argument("--out", type=Path, required=True, metavar="FILE", help=NEW_MAP)
+    add_path(pruned, "--out", "FILE", NEW_MAP, required=True)
+    saved = whats.add_parser("save", parents=[given], help="copy the map of a run")
+    add_path(saved, "--out", "FILE", NEW_MAP, required=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import Any
 
 from companion.app.cli.options import (
+    add_path,
     command,
     configuration,
     depths,
@@ -39,17 +39,15 @@ def add_parsers(commands: Any) -> None:
     """Add it to the subparsers of the program."""
     depth = command(
         commands, "depth", _depth, parents=[configuration()],
-        help="dense depth from images with known poses",
+        help="make dense depth from images with known poses",
         description="Reconstruct the depth of reference frames. DATASET is a flight's folder with "
         "trajectory.tum in it, or a data set with ground truth.",
     )  # fmt: skip
-    depth.add_argument("dataset", type=Path, metavar="DATASET", help="its folder")
-    depth.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the results"
-    )
+    add_path(depth, "dataset", "DATASET", "its folder")
+    add_path(depth, "--out", "DIR", "folder for the results", required=True)
     depth.add_argument(
         "--reference", type=int, metavar="N",
-        help="only this frame, from all others (default: a new one as the view moves on)",
+        help="only this frame, from all others (default: another one whenever the view moves on)",
     )  # fmt: skip
     depth.add_argument(
         "--frames", type=frames, default=(None, None), metavar="A:B",
@@ -57,6 +55,6 @@ def add_parsers(commands: Any) -> None:
     )  # fmt: skip
     depth.add_argument(
         "--range", type=depths, metavar="NEAR:FAR",
-        help="least and greatest depth that there can be, metres (default: found out)",
+        help="least and greatest depth, metres (default: estimated)",
     )  # fmt: skip
-    depth.add_argument("--device", metavar="NAME", help="the same as --set opencl.device=NAME")
+    depth.add_argument("--device", metavar="NAME", help="short for --set opencl.device=NAME")

@@ -28,19 +28,29 @@ def command(commands: Any, name: str, does: Command, **options: Any) -> argparse
     return parser
 
 
+def add_flag(parser: argparse.ArgumentParser, name: str, text: str) -> None:
+    """Add an option without a value."""
+    parser.add_argument(name, action="store_true", help=text)
+
+
+def add_path(
+    parser: argparse.ArgumentParser, name: str, metavar: str, text: str, **options: Any
+) -> None:
+    """Add an argument, or an option, that is a path."""
+    parser.add_argument(name, type=Path, metavar=metavar, help=text, **options)
+
+
 def configuration() -> argparse.ArgumentParser:
     """--config, --set and --profile, for `parents`."""
     options = argparse.ArgumentParser(add_help=False)
-    options.add_argument(
-        "--config", type=Path, metavar="FILE", help="TOML file; see docs/settings.md"
-    )
+    add_path(options, "--config", "FILE", "configuration, a TOML file; see docs/settings.md")
     options.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE",
-        help="set one key, over the file; can be given again",
+        help="set one key; overrides the file; can be repeated",
     )  # fmt: skip
     options.add_argument(
         "--profile", dest="set", action="append", type=profile, metavar="NAME",
-        help=f"settings that fit a computer, below the file: {', '.join(words_of(PROFILE))}",
+        help=f"settings for a computer; the file overrides them: {', '.join(words_of(PROFILE))}",
     )  # fmt: skip
     return options
 
@@ -57,7 +67,7 @@ def profile(name: str) -> str:
 def json_option() -> argparse.ArgumentParser:
     """--json, for `parents`."""
     options = argparse.ArgumentParser(add_help=False)
-    options.add_argument("--json", action="store_true", help="as JSON, for programs")
+    add_flag(options, "--json", "print JSON, for programs")
     return options
 
 

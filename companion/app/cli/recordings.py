@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from companion.app.cli.options import (
+    add_flag,
+    add_path,
     amount,
     at_least,
     check_span,
@@ -150,42 +152,35 @@ def add_parsers(commands: Any) -> None:
 def _add_compare(commands: Any) -> None:
     compare = command(
         commands, "compare", _compare,
-        help="what differs between two runs of a flight, or two maps of a site",
+        help="compare two runs of a flight, or two maps of a site",
         description="Compare the --out folders of two replays of one flight: poses, cloud, times. "
-        "Exit status 1 where a limit is given and not kept. With --maps: what is gone, new or "
-        "moved at a site between two flights.",
+        "Exit status 1 if a given limit is exceeded. With --maps: find what is gone, new or moved "
+        "at a site between two flights.",
     )  # fmt: skip
-    compare.add_argument("run_a", type=Path, metavar="A", help="what --out of one replay was")
-    compare.add_argument("run_b", type=Path, metavar="B", help="and of the other")
-    compare.add_argument(
-        "--maps", action="store_true", help="A and B are site maps of two flights over one site"
-    )
-    compare.add_argument("--out", type=Path, metavar="DIR", help="write a report with plots there")
+    add_path(compare, "run_a", "A", "folder of one replay, its --out")
+    add_path(compare, "run_b", "B", "folder of the other")
+    add_flag(compare, "--maps", "A and B are site maps of two flights over one site")
+    add_path(compare, "--out", "DIR", "write a report with plots there")
     compare.add_argument(
         "--max-apart", type=amount, metavar="M",
         help="limit: RMS distance between their poses, metres",
     )  # fmt: skip
     compare.add_argument(
         "--max-cloud", type=amount, metavar="M",
-        help="limit: distance that 95 %% of points keep to the other cloud, metres",
+        help="limit: distance to the other cloud that 95 %% of points keep, metres",
     )  # fmt: skip
 
 
 def _add_batch(commands: Any) -> None:
     batch = command(
         commands, "batch", _batch, parents=[configuration()],
-        help="replay an archive of flights on many cores",
+        help="replay many flights on many cores",
         description="Replay each flight into a folder of DIR, and write DIR/index.html with a row "
-        "for each. What is done already is not done again. Exit status 1 where a flight failed.",
+        "for each. Finished replays are not repeated. Exit status 1 if a flight failed.",
     )  # fmt: skip
-    batch.add_argument("flights", type=Path, nargs="+", metavar="FLIGHT", help="as for replay")
-    batch.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder of the results' folders"
-    )
-    batch.add_argument(
-        "--merge", action="store_true",
-        help="make one site map of all, DIR/site.map, and more where they show no common place",
-    )  # fmt: skip
+    add_path(batch, "flights", "FLIGHT", "as for `replay`", nargs="+")
+    add_path(batch, "--out", "DIR", "folder for the folders of the results", required=True)
+    add_flag(batch, "--merge", "merge all maps into DIR/site.map; maps of another site stay apart")
     batch.add_argument(
         "--workers", type=at_least(1), metavar="N",
         help="replays at a time, each in a process (default: one per core)",
@@ -198,46 +193,44 @@ def _add_batch(commands: Any) -> None:
 
 def _add_flights(commands: Any) -> None:
     place = argparse.ArgumentParser(add_help=False, parents=[configuration()])
-    place.add_argument(
-        "--flights", type=Path, metavar="DIR",
-        help="folder of all flights (default: daemon.flights of the configuration given, else that "
-        "of the installed service, else ./flights)",
+    add_path(
+        place, "--flights", "DIR",
+        "folder of all flights (default: daemon.flights of the given configuration, else that of "
+        "the installed service, else ./flights)",
     )  # fmt: skip
-    flights = command(commands, "flights", _flights, help="recordings of live flights")
+    flights = command(commands, "flights", _flights, help="list, show or clean up recordings")
     does = flights.add_subparsers(dest="what", required=True, metavar="WHAT")
 
-    does.add_parser("list", parents=[place, json_option()], help="list them")
-    show = does.add_parser("show", parents=[place, json_option()], help="say what is in one")
-    trim = does.add_parser("trim", parents=[place], help="write a part of one as a recording")
+    does.add_parser("list", parents=[place, json_option()], help="list all flights")
+    show = does.add_parser(
+        "show", parents=[place, json_option()], help="show what a recording contains"
+    )
+    trim = does.add_parser("trim", parents=[place], help="write a part as a new recording")
     trim.add_argument("--start", type=seconds, metavar="S", help="from this second on")
     trim.add_argument("--stop", type=seconds, metavar="S", help="up to this second")
-    trim.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .mcap")
+    add_path(trim, "--out", "FILE", "a new .mcap file", required=True)
     export = does.add_parser(
-        "export", parents=[place], help="write one as a flight folder, for other programs",
+        "export", parents=[place], help="write a flight folder, for other programs",
         description="Write pictures as they were recorded, frames.csv, camera.json, config.toml "
-        "and flight.tlog, or telemetry.csv where no bytes of a link were recorded.",
+        "and flight.tlog; telemetry.csv instead if no bytes of a link were recorded.",
     )  # fmt: skip
-    export.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    add_path(export, "--out", "DIR", "a new folder", required=True)
     mission = does.add_parser(
         "mission", parents=[place], help="write its path, or the way back, as a mission",
         description="Write the path of a flight as waypoints for a ground station: FILE.plan for "
         "QGroundControl, FILE.waypoints for Mission Planner and MAVProxy. Heights are above sea "
-        "level. Check it before it is flown: nothing of it looks for obstacles.",
+        "level. Check the mission before it is flown: it does not avoid obstacles.",
     )  # fmt: skip
-    mission.add_argument(
-        "--out", type=Path, required=True, metavar="FILE", help="way.plan or way.waypoints"
-    )
+    add_path(mission, "--out", "FILE", "NAME.plan or NAME.waypoints", required=True)
     mission.add_argument(
         "--within", type=amount, default=0.5, metavar="M",
         help="leave out waypoints this near to the line between others, metres (default: 0.5)",
     )  # fmt: skip
-    mission.add_argument(
-        "--back", action="store_true", help="the way back: from the end to the beginning"
-    )
+    add_flag(mission, "--back", "the way back: from the end to the beginning")
     for parser in (show, trim, export):
         parser.add_argument("flight", metavar="FLIGHT", help="name, folder or file")
     mission.add_argument(
-        "flight", metavar="FLIGHT", help="name or folder of a flight, or what --out of a replay was"
+        "flight", metavar="FLIGHT", help="name or folder of a flight, or folder of a replay"
     )
     _add_upkeep(does, place)
 
@@ -245,31 +238,30 @@ def _add_flights(commands: Any) -> None:
 def _add_upkeep(does: Any, place: argparse.ArgumentParser) -> None:
     verify = does.add_parser(
         "verify", parents=[place], help="check all checksums",
-        description="Check all checksums of recordings. Exit status 1 where one is damaged or cut "
-        "short. Changes nothing.",
+        description="Check all checksums of recordings, and change nothing. Exit status 1 if one "
+        "is damaged or cut short.",
     )  # fmt: skip
     repair = does.add_parser(
-        "repair", parents=[place], help="end those that were cut short, where they lie",
-        description="End recordings that were cut short, where they lie. What opens one does the "
-        "same; the daemon does it after its start, for all. Exit status 1 where one cannot be "
-        "repaired.",
+        "repair", parents=[place], help="complete recordings that were cut short",
+        description="Complete recordings that were cut short, in place. This also happens when one "
+        "is opened, and after the daemon starts. Exit status 1 if one cannot be repaired.",
     )  # fmt: skip
-    repair.add_argument(
-        "--gently", action="store_true",
-        help="as the daemon does: only with processors and disk that nobody else wants",
-    )  # fmt: skip
+    add_flag(repair, "--gently", "use only processor and disk time that nothing else wants")
     for parser in (verify, repair):
         parser.add_argument(
             "flights_named", metavar="FLIGHT", nargs="*", help="name, folder or file (default: all)"
         )
     prune = does.add_parser(
-        "prune", parents=[place], help="delete the oldest",
-        description="Delete finished flights with all their results, the oldest first. One with a "
-        'file named "keep" in its folder stays. Of several conditions all must hold.',
+        "prune", parents=[place], help="delete the oldest flights",
+        description="Delete finished flights with all their results, the oldest first. A flight "
+        'whose folder contains a file named "keep" stays. If several conditions are given, all '
+        "must hold.",
     )  # fmt: skip
-    prune.add_argument("--keep-newest", type=at_least(0), metavar="N", help="all but the newest N")
-    prune.add_argument("--older-than", type=amount, metavar="DAYS", help="older than so many days")
+    prune.add_argument("--keep-newest", type=at_least(0), metavar="N", help="keep the newest N")
     prune.add_argument(
-        "--free", type=amount, metavar="MB", help="only until so many megabytes are free"
+        "--older-than", type=amount, metavar="DAYS", help="only flights older than this"
     )
-    prune.add_argument("--dry-run", action="store_true", help="only say which would be deleted")
+    prune.add_argument(
+        "--free", type=amount, metavar="MB", help="only until this many megabytes are free"
+    )
+    add_flag(prune, "--dry-run", "only print which flights would be deleted")

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from companion.app.cli.options import (
+    add_flag,
+    add_path,
     check_span,
     command,
     configuration,
@@ -148,12 +150,10 @@ def add_parsers(commands: Any) -> None:
 def _timing() -> argparse.ArgumentParser:
     """Options about the log of a flight."""
     options = argparse.ArgumentParser(add_help=False)
-    options.add_argument(
-        "--log", type=Path, metavar="LOG", help="telemetry log, where it does not lie beside FLIGHT"
-    )
+    add_path(options, "--log", "LOG", "telemetry log, if it is not beside FLIGHT")
     options.add_argument(
         "--offset", type=shift, metavar="S",
-        help="seconds added to the log's times, instead of finding them by rotation",
+        help="seconds added to the log's times, instead of aligning them by rotation",
     )  # fmt: skip
     return options
 
@@ -162,28 +162,15 @@ def _how() -> argparse.ArgumentParser:
     """Options of a replay."""
     parents = [configuration(), _timing(), json_option()]
     options = argparse.ArgumentParser(add_help=False, parents=parents)
-    options.add_argument(
-        "--start", type=seconds, metavar="S", help="leave out what comes before this second"
-    )
-    options.add_argument(
-        "--stop", type=seconds, metavar="S", help="leave out what comes from this second on"
-    )
+    options.add_argument("--start", type=seconds, metavar="S", help="begin at this second")
+    options.add_argument("--stop", type=seconds, metavar="S", help="end before this second")
     options.add_argument(
         "--viewer", type=viewer, default="none", metavar="WHERE",
         help="show it live: none, web, native, or the rerun+http://… of a running viewer",
     )  # fmt: skip
-    options.add_argument(
-        "--paced", action="store_true",
-        help="in the flight's own time, dropping what a live run would drop",
-    )  # fmt: skip
-    options.add_argument(
-        "--map", type=Path, metavar="MAP",
-        help="locate it in this site map of an earlier flight; over [map] use",
-    )  # fmt: skip
-    options.add_argument(
-        "--as-flown", action="store_true",
-        help="of a recording: do again what was decided in flight, and compare what was sent",
-    )  # fmt: skip
+    add_flag(options, "--paced", "in the flight's own time, dropping what a live run would drop")
+    add_path(options, "--map", "MAP", "site map of an earlier flight to locate it in; sets map.use")
+    add_flag(options, "--as-flown", "repeat a recording's decisions, and compare what was sent")
     return options
 
 
@@ -191,42 +178,39 @@ def _add_replay(commands: Any) -> None:
     replay = command(
         commands, "replay", _replay, parents=[_how()],
         help="turn a logged flight into a metric map",
-        description="Track the camera of a logged flight, reconstruct what it saw, report on it.",
+        description="Track the camera of a logged flight, make its map and cloud, and write a "
+        "report.",
     )  # fmt: skip
-    replay.add_argument(
-        "flight", type=Path, metavar="FLIGHT",
-        help="a recording, a flight's folder, a folder with video or images, a video, photographs, "
-        "a bag, or a data set (EuRoC, KITTI, TUM RGB-D)",
+    add_path(
+        replay, "flight", "FLIGHT",
+        "a recording, a flight's folder, a folder with video or images, a video, photographs, a "
+        "bag, or a data set (EuRoC, KITTI, TUM RGB-D)",
     )  # fmt: skip
-    replay.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the results"
-    )
+    add_path(replay, "--out", "DIR", "folder for the results", required=True)
 
 
 def _add_demo(commands: Any) -> None:
     demo = command(
         commands, "demo", _demo, parents=[_how()], help="replay the sample flight: a first look",
         description="Replay the sample flight that comes with the program, or another. It needs an "
-        "OpenCL device, as every dense map does, and takes a minute or two.",
+        "OpenCL device for the dense map, and takes a minute or two.",
     )  # fmt: skip
-    demo.add_argument("flight", type=Path, nargs="?", metavar="FLIGHT", help="as for replay")
-    demo.add_argument(
-        "--out", type=Path, default=Path("out/demo"), metavar="DIR",
-        help="folder for the results (default: %(default)s)",
+    add_path(demo, "flight", "FLIGHT", "as for `replay`", nargs="?")
+    add_path(
+        demo, "--out", "DIR", "folder for the results (default: %(default)s)",
+        default=Path("out/demo"),
     )  # fmt: skip
 
 
 def _add_import(commands: Any) -> None:
     imported = command(
         commands, "import", _import, parents=[configuration(), _timing()],
-        help="write any flight as a flight folder or a recording",
-        description="Read a flight of any format and write it, all on one clock: as a folder with "
-        "pictures, times, calibration and telemetry, or as FILE.mcap, a recording.",
+        help="convert any flight to a flight folder or a recording",
+        description="Read a flight of any format, and write it on one clock: a folder with "
+        "pictures, times, calibration and telemetry, or a recording, FILE.mcap.",
     )  # fmt: skip
-    imported.add_argument("source", type=Path, metavar="SOURCE", help="as for replay")
-    imported.add_argument(
-        "--out", type=Path, required=True, metavar="OUT", help="a new folder, or FILE.mcap"
-    )
+    add_path(imported, "source", "SOURCE", "as for `replay`")
+    add_path(imported, "--out", "OUT", "a new folder, or FILE.mcap", required=True)
 
 
 def _add_export(commands: Any) -> None:
@@ -234,41 +218,33 @@ def _add_export(commands: Any) -> None:
         commands, "export", _export, parents=[configuration()],
         help="write a replay's results in other formats",
         description="Write clouds, rasters and paths for other programs, from the folder of a "
-        "finished replay, with a statement of accuracy beside each.",
+        "finished replay, each with a statement of its accuracy.",
     )  # fmt: skip
-    export.add_argument("run", type=Path, metavar="RUN", help="what --out of the replay was")
+    add_path(export, "run", "RUN", "folder of the replay, its --out")
     export.add_argument(
         "--as", dest="formats", metavar="FORMATS",
         help="any of ply,pcd,las,laz,copc,dsm,ortho,mosaic,glb,mesh,textured,tiles,colmap,"
         "nerfstudio,tum,kitti,euroc,gpx,kml,geojson; see docs/formats.md",
     )  # fmt: skip
-    export.add_argument(
-        "--flight", type=Path, metavar="FLIGHT",
-        help="what was replayed: its pictures, which mosaic, textured, colmap and nerfstudio need",
+    add_path(
+        export, "--flight", "FLIGHT",
+        "the replayed flight, whose pictures mosaic, textured, colmap and nerfstudio need",
     )  # fmt: skip
-    export.add_argument("--out", type=Path, metavar="DIR", help="folder for them (default: RUN)")
+    add_path(export, "--out", "DIR", "folder to write into (default: RUN)")
 
 
 def _add_film(commands: Any) -> None:
     film = command(
         commands, "film", _film, parents=[configuration()],
-        help="make a film of a flight, to be shown",
+        help="make a film of a flight",
         description="Make a film of path and cloud as they grow, beside the picture.",
     )  # fmt: skip
-    film.add_argument("run", type=Path, metavar="RUN", help="what --out of the replay was")
-    film.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .mp4 or .webp")
-    film.add_argument(
-        "--flight", type=Path, metavar="FLIGHT", help="what was replayed: its pictures"
-    )
-    film.add_argument(
-        "--seconds", type=within(1, 600), default=30.0, metavar="S",
-        help="its length in seconds (default: 30)",
-    )  # fmt: skip
-    film.add_argument(
-        "--height", type=within(120, 2160, int), default=720, metavar="PX",
-        help="its height in pixels (default: 720)",
-    )  # fmt: skip
-    film.add_argument(
-        "--rate", type=within(1, 60, int), default=25, metavar="HZ",
-        help="frames a second (default: 25)",
-    )  # fmt: skip
+    add_path(film, "run", "RUN", "folder of the replay, its --out")
+    add_path(film, "--out", "FILE", "a new .mp4 or .webp file", required=True)
+    add_path(film, "--flight", "FLIGHT", "the replayed flight, for its pictures")
+    for name, kind, default, unit, text in (
+        ("--seconds", within(1, 600), 30.0, "S", "length, seconds (default: 30)"),
+        ("--height", within(120, 2160, int), 720, "PX", "height, pixels (default: 720)"),
+        ("--rate", within(1, 60, int), 25, "HZ", "frames per second (default: 25)"),
+    ):
+        film.add_argument(name, type=kind, default=default, metavar=unit, help=text)

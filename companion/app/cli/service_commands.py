@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from companion.app.cli.options import command
+from companion.app.cli.options import add_flag, add_path, command
 from companion.app.stopping import StopSignals
 
 
@@ -32,33 +31,26 @@ def _notify(text: str) -> None:
 def add_parsers(commands: Any) -> None:
     """Add them to the subparsers of the program."""
     either = argparse.ArgumentParser(add_help=False)
-    either.add_argument(
-        "--user", action="store_true", help="a service of yours, without root; for the bench"
-    )
-    either.add_argument(
-        "--dry-run", action="store_true", help="only say what would be done, step by step"
-    )
+    add_flag(either, "--user", "your own service, without root; for the bench")
+    add_flag(either, "--dry-run", "only print what would be done, step by step")
     install = command(
         commands, "install", _install, parents=[either],
-        help="have it start with the computer, by systemd",
-        description="Set up user, environment, configuration, unit and names of devices. What is "
-        "there already is left as it is, so that it can be run again; if a step fails, those "
+        help="install the service, which starts with the computer",
+        description="Create user, environment, configuration, systemd unit and device names. What "
+        "exists already is left as it is, so the command can be repeated. If a step fails, those "
         "before it are undone.",
     )  # fmt: skip
-    install.add_argument(
-        "--config", type=Path, metavar="FILE",
-        help="the service's configuration; without it the one that is there is kept",
+    add_path(
+        install, "--config", "FILE", "configuration of the service (default: the existing one)"
+    )
+    add_path(
+        install, "--venv", "DIR",
+        "create the environment there (default: the present one, or /opt/companion if a service "
+        "cannot read that)",
     )  # fmt: skip
-    install.add_argument(
-        "--venv", type=Path, metavar="DIR",
-        help="make the environment there (default: the present one, or /opt/companion where a "
-        "service cannot read that)",
-    )  # fmt: skip
-    install.add_argument("--now", action="store_true", help="start it, too")
+    add_flag(install, "--now", "start the service, too")
     uninstall = command(
         commands, "uninstall", _uninstall, parents=[either],
-        help="take the service away; flights and configuration stay",
+        help="remove the service; flights and configuration stay",
     )  # fmt: skip
-    uninstall.add_argument(
-        "--purge", action="store_true", help="take flights, configuration and user away, too"
-    )
+    add_flag(uninstall, "--purge", "remove flights, configuration and user, too")
