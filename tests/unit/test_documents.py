@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from functools import cache
 from pathlib import Path
 
@@ -29,6 +30,8 @@ NAMED = sorted(
 MOST_LINES = 150
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 OUTSIDE = ("http://", "https://", "mailto:")
+STANDS_FOR = {"N": "1", "A:B": "1:2", "NEAR:FAR": "1:2"}
+"""Values for the capitals that a number is given by."""
 
 
 def name_of(path: Path) -> str:
@@ -117,6 +120,27 @@ def test_settings_in_texts_are_those_of_this_version(tmp_path: Path) -> None:
             (tmp_path / "block.toml").write_text(block, "utf-8")
             load_config(tmp_path / "block.toml", warn=old.append)
     assert not old
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_commands_in_blocks_of_code_are_right(
+    page: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As the parsers take them; brackets are optional parts, capitals stand for values."""
+    parser, text = command_parser(), page.read_text("utf-8")
+    wrong = []
+    fenced = re.findall(r"^ *```(?:sh)?\n(.*?)^ *```$", text, re.M | re.S)
+    indented = re.findall(r"\n\n((?:    .*\n|\n)+)", text)
+    for line in "\n".join(fenced + indented).replace("\\\n", " ").splitlines():
+        found = re.match(r" *(?:sudo )?(?:[\w./]+/)?companion (?!-)(.*)", line)
+        if found is not None:
+            command = re.sub(r"\[(--[^]]*)\]", r"\1", found[1].partition(" #")[0])
+            words = [STANDS_FOR.get(word, word) for word in shlex.split(command)]
+            try:
+                parser.parse_args(words)
+            except SystemExit:
+                wrong.append(f"{line}: {capsys.readouterr().err.splitlines()[-1]}")
+    assert not wrong
 
 
 def test_the_page_of_commands_is_made_of_the_parsers() -> None:
