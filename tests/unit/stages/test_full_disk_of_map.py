@@ -25,7 +25,8 @@ def test_it_is_told_once(tmp_path: Path) -> None:
         warned = [each for each in out if isinstance(each, Warned)]
         told.append([each for each in warned if each.what == IN_MEMORY])
         if seq == 1:
-            file = stage._stage._tracker.atlas.far_file  # type: ignore[attr-defined]
+            file = stage._stage._tracker.atlas.far_file
+            assert file is not None
             assert file.put([np.zeros(9)]) is None
     list(stage.finish(Finish(hurry=True)))
     assert [len(each) for each in told] == [0, 0, 1, 0]

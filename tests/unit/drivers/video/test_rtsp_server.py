@@ -47,7 +47,7 @@ def test_a_stage_shows_what_it_is_given_and_works_only_while_somebody_watches() 
         recorder=RecorderConfig(h264_encoder="libx264"),
     )  # fmt: skip
     stage = work(Setup(config, Camera(WIDTH, HEIGHT, 500, 500, 320, 240)))
-    server: RtspServer = stage._server  # type: ignore[attr-defined]
+    server: RtspServer = stage._server
     over = threading.Event()
 
     def film() -> None:
