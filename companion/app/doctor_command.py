@@ -14,10 +14,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, TextIO
 
-from companion.advice.imu_room import BITS_PER_BYTE, LOOP_RATE, check_loop_rate, imu_room
-from companion.advice.line_rate import check_line, line_parameters
-from companion.advice.pose_parameters import advise, names_to_read
-from companion.advice.wanted import ARDUPILOT, FIRMWARES, Finding
 from companion.app.doctor_findings import (
     Examination,
     counted,
@@ -26,6 +22,10 @@ from companion.app.doctor_findings import (
     print_outcome,
 )
 from companion.config import Config, LinkConfig
+from companion.doctor.imu_room import BITS_PER_BYTE, LOOP_RATE, check_loop_rate, imu_room
+from companion.doctor.line_rate import check_line, line_parameters
+from companion.doctor.pose_parameters import advise, names_to_read
+from companion.doctor.wanted import ARDUPILOT, FIRMWARES, Finding
 from companion.errors import ConfigError, InputError, SourceError
 from drivers.mavlink.asking_link import asking_link
 from drivers.mavlink.parameters import Parameters

@@ -7,8 +7,8 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any, TextIO
 
-from companion.advice.wanted import Finding
 from companion.config import Config
+from companion.doctor.wanted import Finding
 from drivers.mavlink.vehicle import Vehicle
 
 

@@ -15,8 +15,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.advice.line_rate import FULL, sent_bytes_per_s
 from companion.config import FeedbackConfig, LinkConfig
+from companion.doctor.line_rate import FULL, sent_bytes_per_s
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import SourceHealth
 from companion.messages import Warned

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.advice.imu_room import LEAST_HZ, ImuRoom, in_whole_ms
+from companion.doctor.imu_room import LEAST_HZ, ImuRoom, in_whole_ms
 from drivers.mavlink.message_rates import MessageRates
 from drivers.telemetry.mavlink_samples import IMU_REQUESTS, Wanted
 

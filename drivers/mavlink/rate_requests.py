@@ -7,8 +7,8 @@ from collections.abc import Awaitable, Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.advice.imu_room import imu_room
 from companion.config import LinkConfig
+from companion.doctor.imu_room import imu_room
 from companion.messages import Warned
 from companion.timing.clock import FlightClock
 from drivers.mavlink.commands import NO_ANSWER, REFUSALS

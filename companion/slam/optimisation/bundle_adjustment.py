@@ -13,14 +13,14 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from companion.geometry.transforms import Array, Pose, rotation_from_vector
-from companion.slam.compiled.bundle_sums import (
+from companion.slam.compiled.bundle_kernels import (
     back_substitute,
     damped_inverses,
     errors,
     normal_equations,
     schur_complement,
 )
-from companion.slam.compiled.pose_sums import CHI2_2D
+from companion.slam.compiled.pose_kernels import CHI2_2D
 from companion.slam.features.orb_features import Bools, Ints
 from companion.slam.optimisation.factors import Factor
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from companion.geometry.transforms import Array, Pose, nearest_rotation
-from companion.slam.compiled.pose_sums import CHI2_2D, HUBER, cost, refine
+from companion.slam.compiled.pose_kernels import CHI2_2D, HUBER, cost, refine
 from companion.slam.features.orb_features import Bools
 
 __all__ = ["CHI2_2D", "HUBER", "refine_pose", "robust_cost", "solve_sqpnp"]

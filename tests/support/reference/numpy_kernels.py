@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, nearest_rotation, rotation_from_vector, skew
 from companion.messages import Bytes, Floats
-from companion.slam.compiled.pose_sums import CHI2_2D, HUBER
+from companion.slam.compiled.pose_kernels import CHI2_2D, HUBER
 from companion.slam.features.orb_features import Bools, Features, Ints
 from companion.slam.map.sparse_map import SlamMap
 

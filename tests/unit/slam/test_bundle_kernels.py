@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from companion.geometry.transforms import Array, rotation_from_vector
-from companion.slam.compiled.bundle_sums import (
+from companion.slam.compiled.bundle_kernels import (
     back_substitute,
     damped_inverses,
     errors,

@@ -8,7 +8,7 @@ from collections import Counter, defaultdict
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.advice.imu_room import ImuRoom
+from companion.doctor.imu_room import ImuRoom
 from drivers.mavlink.imu_rate import FEWER, NO_IMU, ImuNews, ImuRate
 from drivers.mavlink.message_rates import MessageRates
 from drivers.telemetry.mavlink_samples import Wanted

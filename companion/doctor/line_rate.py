@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from companion.advice.imu_room import (
+from companion.config import FeedbackConfig, LinkConfig
+from companion.doctor.imu_room import (
     BAUD_NAME,
     BITS_PER_BYTE,
     MAX_LOAD,
@@ -11,8 +12,7 @@ from companion.advice.imu_room import (
     imu_bytes_per_s,
     signature_bytes,
 )
-from companion.advice.wanted import ARDUPILOT, PX4, Finding, Values
-from companion.config import FeedbackConfig, LinkConfig
+from companion.doctor.wanted import ARDUPILOT, PX4, Finding, Values
 
 POSE_BYTES = {"odometry": 245, "vision_position": 129 + 69, "velocity": 245}
 FLOW_BYTES = {"optical_flow": 46, "optical_flow_rad": 56}

@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.advice.imu_room import (
+from companion.config import FeedbackConfig, LinkConfig
+from companion.doctor.imu_room import (
     ATTITUDE_BYTES,
     GPS_BYTES,
     HEIGHT_BYTES,
@@ -21,8 +22,7 @@ from companion.advice.imu_room import (
     imu_room,
     in_whole_ms,
 )
-from companion.advice.line_rate import check_line
-from companion.config import FeedbackConfig, LinkConfig
+from companion.doctor.line_rate import check_line
 
 UNSIGNED, SIGNED = LinkConfig(), LinkConfig(signing_key_file="key")
 

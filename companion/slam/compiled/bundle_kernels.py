@@ -14,7 +14,7 @@ from companion.slam.compiled.compiling import (
     number,
     pairs,
 )
-from companion.slam.compiled.pose_sums import HUBER
+from companion.slam.compiled.pose_kernels import HUBER
 
 _BEHIND_COST = HUBER * 100.0
 _LEAST = 1e-9

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from companion.advice.wanted import ARDUPILOT, PX4, Between, Bits, Near, OneOf, Values, Wanted
 from companion.config import FeedbackConfig, GpsConfig, LandingConfig
+from companion.doctor.wanted import ARDUPILOT, PX4, Between, Bits, Near, OneOf, Values, Wanted
 
 DELAY_TOLERANCE_MS = 15.0
 MAX_VISO_DELAY_MS = 250.0

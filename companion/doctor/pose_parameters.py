@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from companion.advice.firmware_rules import COMPARED, EITHER_OF, RULES, Context, Rule, fused
-from companion.advice.wanted import ARDUPILOT, PX4, Finding, Values
 from companion.config import FeedbackConfig, GpsConfig, LandingConfig
+from companion.doctor.parameter_rules import COMPARED, EITHER_OF, RULES, Context, Rule, fused
+from companion.doctor.wanted import ARDUPILOT, PX4, Finding, Values
 
 NO_SWITCH, NO_MARKER = GpsConfig(), LandingConfig()
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from companion.advice.firmware_rules import RULES
-from companion.advice.line_rate import check_line, line_parameters, sent_bytes_per_s
-from companion.advice.pose_parameters import advise, names_to_read
-from companion.advice.wanted import FIRMWARES, Finding
 from companion.config import FeedbackConfig, GpsConfig, LandingConfig, LinkConfig
+from companion.doctor.line_rate import check_line, line_parameters, sent_bytes_per_s
+from companion.doctor.parameter_rules import RULES
+from companion.doctor.pose_parameters import advise, names_to_read
+from companion.doctor.wanted import FIRMWARES, Finding
 from tests.support.autopilot import fake_parameters
 
 NEW = {

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from companion.advice.wanted import ARDUPILOT, PX4, Finding, Values
 from companion.config import LinkConfig
+from companion.doctor.wanted import ARDUPILOT, PX4, Finding, Values
 
 MAX_LOAD, PX4_LOAD = 0.6, 0.5
 """Largest utilisation of a line; beyond, stamps are delayed. PX4 keeps to half (MAV_x_RATE)."""
