@@ -191,7 +191,7 @@ REASONS: Mapping[str, str] = {
     "poses come too late": "too late",
     "no frames": "no video",
     "localisation begins anew": "restarting",
-    "belief must hold first": "being checked",
+    "waiting for proof": "being checked",
     "the autopilot is silent": "autopilot silent",
     "no autopilot attitude": "no attitude",
     "attitude is not believed": "attitude not used",

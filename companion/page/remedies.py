@@ -159,7 +159,7 @@ OF_REASON: Mapping[str, str] = {
     "poses come too late": "The computer has too much to do: depth.enabled = false, cooling.",
     "no frames": "No pictures come: see the camera.",
     "localisation begins anew": "Wait some seconds.",
-    "belief must hold first": "Wait: poses must be good for expert.feedback.resume_after_s first.",
+    "waiting for proof": "Wait: poses must be good for expert.feedback.resume_after_s first.",
     "the autopilot is silent": "Nothing is heard of the autopilot: cable, baud.",
     "no autopilot attitude": "The autopilot sends no attitude: see its stream rates.",
     "attitude is not believed": "telemetry.use leaves out attitude.",

@@ -46,7 +46,7 @@ RESTARTED = "localisation begins anew"
 RESET = "position reset"
 REBOOTED = "autopilot rebooted"
 NO_HEIGHT = "no autopilot height"
-PROVING = "belief must hold first"
+PROVING = "waiting for proof"
 
 
 class Sending(Enum):

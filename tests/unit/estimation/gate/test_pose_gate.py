@@ -85,7 +85,7 @@ class Flight:
 def test_nothing_is_sent_before_proof() -> None:
     flight = Flight()
     assert not flight.run(0.9)
-    assert flight.gate.why_not == "belief must hold first"
+    assert flight.gate.why_not == "waiting for proof"
     assert flight.run(0.5)
 
 
@@ -206,7 +206,7 @@ def test_every_reset_is_proven() -> None:
     flight.run(2)
     reset_ns = flight.now_ns
     flight.run(0.1, reset_counter=1)
-    assert not flight.gate.sending and flight.gate.why_not == "belief must hold first"
+    assert not flight.gate.sending and flight.gate.why_not == "waiting for proof"
     poses = flight.run(2, reset_counter=1)
     first_ns = next(at for at, pose in flight.sent if pose.reset_counter)
     assert first_ns - reset_ns >= 1000 * MS
