@@ -19,15 +19,15 @@ from itsdangerous import BadSignature, URLSafeSerializer
 
 from companion.errors import SourceError
 from companion.page.codes import FILE, Codes, new_codes, plain, read_codes, write_codes
-from companion.page.token_buckets import TokenBuckets
+from companion.timing.rate_limit import PeerLimit
 
 COOKIE = "companion"
 KEPT_S = 30 * 86400
 """Time for which a browser keeps a session."""
-ONE_PEER_HZ, ONE_PEER_BURST = 1 / 12, 5.0
-ALL_HZ, ALL_BURST = 1 / 3, 20.0
-"""Attempts with a code, of one peer and of all."""
-ALL = "all"
+ONE_PEER, ALL_PEERS = (1 / 12, 5.0), (1 / 3, 20.0)
+"""Attempts with a code, of one peer and of all: a second, and at once."""
+MOST_PEERS = 256
+"""Peers that are remembered."""
 
 
 class Right(IntEnum):
@@ -53,8 +53,7 @@ class Access:
         self._flights, self._say = flights, say
         self._stamp: tuple[int, int] | None = None
         self._codes = self._first_codes()
-        self._by_peer = TokenBuckets(ONE_PEER_HZ, ONE_PEER_BURST, clock)
-        self._by_all = TokenBuckets(ALL_HZ, ALL_BURST, clock)
+        self._attempts, self._clock = PeerLimit(ONE_PEER, ALL_PEERS, MOST_PEERS), clock
 
     def session(self, cookie: str | None, peer: str) -> Session:
         """The session of a request, by its cookie and the address it comes from."""
@@ -69,7 +68,7 @@ class Access:
     def pair(self, code: str, peer: str) -> str | None:
         """Cookie of a new session; None for a wrong code. PermissionError where tried too often."""
         self._look_for_new_codes()
-        if not (self._by_peer.take(peer) and self._by_all.take(ALL)):
+        if not self._attempts.allows(peer, round(self._clock() * 1e9)):
             raise PermissionError
         given = plain(code).encode()
         right = Right.NONE

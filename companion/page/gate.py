@@ -11,14 +11,13 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from companion.page.access import ALL, is_here
-from companion.page.token_buckets import TokenBuckets
+from companion.page.access import MOST_PEERS, is_here
+from companion.timing.rate_limit import PeerLimit
 
 MOST_BODY_BYTES = 65536
 """The longest form is that of all settings, some 10 kB."""
-PEER_HZ, PEER_BURST = 60.0, 120.0
-"""One open view asks seven times a second, and loads four files at once."""
-ALL_HZ, ALL_BURST = 120.0, 240.0
+ONE_PEER, ALL_PEERS = (60.0, 120.0), (120.0, 240.0)
+"""Requests a second, and at once: an open view asks seven times a second, and loads four files."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; "
     "base-uri 'none'; form-action 'self'; frame-ancestors 'none'",
@@ -38,16 +37,15 @@ class Gate:
     """ASGI application around the page's own; `clock` gives seconds."""
 
     def __init__(self, inner: ASGIApp, clock: Callable[[], float]) -> None:
-        self._inner = inner
-        self._by_peer = TokenBuckets(PEER_HZ, PEER_BURST, clock)
-        self._by_all = TokenBuckets(ALL_HZ, ALL_BURST, clock)
+        self._inner, self._clock = inner, clock
+        self._requests = PeerLimit(ONE_PEER, ALL_PEERS, MOST_PEERS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request through, or refuse it."""
         if scope["type"] != "http":
             return
         headers, peer = Headers(scope=scope), (scope.get("client") or ("",))[0]
-        if not (self._by_peer.take(peer) and self._by_all.take(ALL)):
+        if not self._requests.allows(peer, round(self._clock() * 1e9)):
             answer = PlainTextResponse("too many requests", 429, {"Retry-After": "2"})
         elif not _is_short(headers):
             answer = PlainTextResponse("longer than any form here", 413, {"Connection": "close"})

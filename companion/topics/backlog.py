@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.messages import MapUpdate
+from companion.timing.rate_limit import RateLimit
 from companion.topics.envelope import Envelope
 from companion.topics.keyframe_bundle import Bundle, MapChange
 
@@ -30,12 +31,12 @@ class Backlog:
     """Bundles of one flight for nodes that fetch them; thread-safe. A budget of 0 is no limit."""
 
     def __init__(self, run: str, capacity_bytes: int, budget_bytes_s: float) -> None:
-        self._run, self._capacity_bytes, self._budget_bytes_s = run, capacity_bytes, budget_bytes_s
+        self._run, self._capacity_bytes = run, capacity_bytes
+        self._budget = RateLimit(budget_bytes_s, SAVED_S * budget_bytes_s)
         self._held: deque[_Held] = deque()
         self._n_bytes = 0
         self._map: MapUpdate | None = None
         self._lock = threading.Lock()
-        self._allowed_bytes, self._allowed_s = 0.0, 0.0
         self.n_evicted = 0
         """Bundles evicted before anybody had fetched them."""
         self.fetched = -1
@@ -77,17 +78,12 @@ class Backlog:
                 data = Bundle(self._run, found.number - 1, change=change).pack()
             else:
                 data = found.data
-            self._allowed_bytes -= len(data)
+            self._budget.take(len(data))
             return data
 
     def _may(self, now_s: float) -> bool:
-        if not self._budget_bytes_s:
-            return True
-        passed_s = min(now_s - self._allowed_s, SAVED_S) if self._allowed_s else SAVED_S
-        most = SAVED_S * self._budget_bytes_s
-        self._allowed_bytes = min(self._allowed_bytes + passed_s * self._budget_bytes_s, most)
-        self._allowed_s = now_s
-        return self._allowed_bytes > 0
+        self._budget.refill(round(now_s * 1e9))
+        return not self._budget.per_s or self._budget.left > 0
 
     def _wait(self) -> bytes:
         return Envelope("wait", {"run": self._run, "newest": self.newest}, {}).pack()

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from companion.messages import Frame, KeyframeAdded, MapUpdate, Track, TrackRefined
+from companion.timing.rate_limit import RateLimit
 from companion.topics.image_jpeg import jpeg_of, without_colour
 from companion.topics.keyframe_bundle import Bundle, MapChange, MapChanges, Picture
 
@@ -23,7 +24,7 @@ LEAST_STEP = 0.01
 """Least baseline of frames over the median depth."""
 LEAST_FRAMES = 4
 """Frames beside its own that a keyframe needs to get depth."""
-SAVED_NS = 3_000_000_000
+SAVED_S = 3.0
 """Time for which unused budget is kept."""
 GREY_SHARE = 0.9
 """Size of a grey picture over that of the same in colour."""
@@ -33,7 +34,8 @@ class Gatherer:
     """Gives a bundle at each map update; `budget_bytes_s` of 0 is no limit."""
 
     def __init__(self, run: str, budget_bytes_s: float, jpeg_quality: int) -> None:
-        self._run, self._budget_bytes_s, self._quality = run, budget_bytes_s, jpeg_quality
+        self._run, self._quality = run, jpeg_quality
+        self._budget = RateLimit(budget_bytes_s, SAVED_S * budget_bytes_s)
         self.n_dropped = 0
         """Frames useful for depth, dropped for the budget or for capacity."""
         self._frames: OrderedDict[int, tuple[int, bytes]] = OrderedDict()
@@ -44,7 +46,6 @@ class Gatherer:
         self._tracked: dict[int, Track] = {}
         self._changes = MapChanges()
         self._number = 0
-        self._budget_left_bytes, self._budget_at_ns = SAVED_NS * 1e-9 * budget_bytes_s, 0
         self._last_place: tuple[float, ...] | None = None
         self.keyframe_jpegs: dict[int, bytes] = {}
         """Pictures of the keyframes of the last bundle, by keyframe id."""
@@ -75,14 +76,7 @@ class Gatherer:
         jpeg = jpeg_of(frame.rgb, self._quality)
         self._frames[frame.seq] = (frame.t_ns, jpeg)
         self._frame_bytes += len(jpeg)
-        if self._budget_at_ns:
-            self._budget_left_bytes += (
-                max(frame.t_ns - self._budget_at_ns, 0) * 1e-9 * self._budget_bytes_s
-            )
-        self._budget_left_bytes = min(
-            self._budget_left_bytes, SAVED_NS * 1e-9 * self._budget_bytes_s
-        )
-        self._budget_at_ns = frame.t_ns
+        self._budget.refill(frame.t_ns)
         while len(self._frames) > MOST_WAITING or self._frame_bytes > MOST_WAITING_BYTES:
             seq = next(iter(self._frames))
             self._forget(seq)
@@ -114,7 +108,7 @@ class Gatherer:
             if seq not in owners:
                 jpeg = without_colour(jpeg, self._quality)
             out.append(Picture(seq, t_ns, jpeg, seq in owners))
-            self._budget_left_bytes -= len(jpeg)
+            self._budget.take(len(jpeg))
         self.n_dropped += len(useful) - len(chosen)
         for seq in [s for s in self._frames if s <= newest]:
             self._forget(seq)
@@ -145,10 +139,10 @@ class Gatherer:
         """Frames within the budget, evenly spread."""
         others = [seq for seq in seqs if seq not in keyframes]
         capacity = MOST_PICTURES - len(keyframes)
-        if self._budget_bytes_s and others:
+        if self._budget.per_s and others:
             own_bytes = sum(len(self._frames[seq][1]) for seq in keyframes)
             each_bytes = GREY_SHARE * float(np.mean([len(self._frames[s][1]) for s in others]))
-            capacity = min(capacity, int((self._budget_left_bytes - own_bytes) / each_bytes))
+            capacity = min(capacity, int((self._budget.left - own_bytes) / each_bytes))
             if capacity < min(LEAST_FRAMES, len(others)):
                 return []
         if len(others) > capacity:

@@ -33,7 +33,7 @@ from drivers.mavlink.camera_messages import (
 )
 from drivers.mavlink.ground.command_server import CommandServer
 from drivers.mavlink.ground.ground_requests import COMMANDS
-from drivers.mavlink.ground.request_limit import RequestLimit
+from drivers.mavlink.ground.request_limit import request_limit
 from drivers.mavlink.message_requests import HEARTBEAT, MessageRequests
 
 CAMERA: int = mavlink.MAV_COMP_ID_CAMERA
@@ -52,7 +52,7 @@ class CameraComponent:
     ) -> None:  # fmt: skip
         self._clock, self._port = clock, link.port
         self._port.second_component = CAMERA
-        self._limit = RequestLimit()
+        self._limit = request_limit()
         began_ns = clock.now_ns()
 
         def boot_ms() -> int:

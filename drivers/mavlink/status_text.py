@@ -10,7 +10,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.pilot_messages import LEFT_OUT, PilotText
-from drivers.mavlink.wire.send_queue import RateLimit
+from companion.timing.rate_limit import RateLimit
 
 TEXTS_PER_S, TEXTS_AT_ONCE = 1.0, 12
 WARNINGS_ONLY = 4

@@ -46,6 +46,7 @@ from companion.pilot_messages import NEW_MAP as NEW_MAP_TEXT
 from companion.products.newest_file import NewestFile
 from companion.runtime.stage_protocol import Snapshot
 from companion.timing.clock import FlightClock
+from companion.timing.rate_limit import RateLimit
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.ground.command_server import (
     ACCEPTED,
@@ -59,7 +60,6 @@ from drivers.mavlink.ground.command_server import (
 from drivers.mavlink.ground.ground_requests import GroundRequests
 from drivers.mavlink.ground.mission_server import MissionServer
 from drivers.mavlink.ground.parameter_server import NOT_NOW, OUT_OF_RANGE, SET, ParameterServer
-from drivers.mavlink.wire.send_queue import RateLimit
 from drivers.system.journal import INFO, WARNING, Journal
 
 MAPPING, NEW_MAP, SNAPSHOT, BUDGET = 31010, 31011, 31012, 31013

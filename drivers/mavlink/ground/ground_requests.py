@@ -17,7 +17,7 @@ from companion.timing.clock import FlightClock
 from drivers.mavlink.ground.command_server import CommandServer
 from drivers.mavlink.ground.mission_server import MISSIONS, MissionServer
 from drivers.mavlink.ground.parameter_server import ParameterServer
-from drivers.mavlink.ground.request_limit import RequestLimit
+from drivers.mavlink.ground.request_limit import request_limit
 from drivers.mavlink.wire.message_port import MavlinkPort
 
 TICK_S = 0.025
@@ -48,7 +48,7 @@ class GroundRequests:
     ) -> None:
         self._port, self._clock, self._warn = port, clock, warn
         self._commands, self._parameters, self._missions = commands, parameters, missions
-        self._limit = RequestLimit()
+        self._limit = request_limit()
         self._warned_ns: int | None = None
 
     def take(self, message: Any, now_ns: int) -> None:

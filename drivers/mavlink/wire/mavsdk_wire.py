@@ -15,10 +15,11 @@ import time
 import mavsdk
 
 from companion.errors import ConfigError, SourceError
+from companion.timing.rate_limit import RateLimit
 from drivers.mavlink.wire.baud import BAUDS, BaudSearch
 from drivers.mavlink.wire.link_url import Endpoint
 from drivers.mavlink.wire.mavsdk_carrier import Carrier, complaints
-from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
+from drivers.mavlink.wire.send_queue import PacketQueue
 from drivers.mavlink.wire.thread_call import in_thread
 from drivers.mavlink.wire.wire import Wire, WireEnd
 

@@ -13,9 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.config import RouterConfig
+from companion.timing.rate_limit import RateLimit
 from drivers.mavlink.wire.link_url import client_endpoint
 from drivers.mavlink.wire.packet_stream import MavlinkStream, Packet
-from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
+from drivers.mavlink.wire.send_queue import PacketQueue
 from drivers.mavlink.wire.tcp_listener import TcpListener
 from drivers.mavlink.wire.tcp_wire import TcpConnection
 from drivers.mavlink.wire.udp_wire import UdpWire
@@ -234,7 +235,7 @@ class Router:
     def _pump(self) -> None:
         self._pump_later = None
         rate, budget = self._link.bytes_per_s, self._budget
-        budget.bytes_per_s = max(1.0, CLIENTS_SHARE * rate)
+        budget.per_s = max(1.0, CLIENTS_SHARE * rate)
         budget.burst = max(LEAST_BURST, BURST_S * rate)
         budget.left = max(budget.left, -budget.burst)
         budget.refill(time.monotonic_ns())

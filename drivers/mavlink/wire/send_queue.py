@@ -1,4 +1,4 @@
-"""Send queue and rate limit of a wire."""
+"""Send queue of a wire."""
 
 from __future__ import annotations
 
@@ -58,27 +58,3 @@ class PacketQueue:
         self.n_dropped += 1
         if begun is not None:
             self._packets.appendleft(begun)
-
-
-class RateLimit:
-    """Token bucket in bytes a second, up to `burst`; `left` below zero is a debt."""
-
-    def __init__(self, bytes_per_s: float, burst: float) -> None:
-        self.bytes_per_s = bytes_per_s
-        self.burst = burst
-        self.left = burst
-        self._last_ns = 0
-
-    def refill(self, now_ns: int) -> None:
-        """Add the tokens since the last call."""
-        gained = (now_ns - self._last_ns) * 1e-9 * self.bytes_per_s
-        self.left = min(self.burst, self.left + max(0.0, gained))
-        self._last_ns = now_ns
-
-    def take(self, n_bytes: float) -> None:
-        """Use tokens, available or not."""
-        self.left -= n_bytes
-
-    def wait_s(self, wanted: float = 0.0) -> float:
-        """Seconds until this many are available."""
-        return max(0.0, (wanted - self.left) / self.bytes_per_s)

@@ -8,9 +8,10 @@ import socket
 import time
 
 from companion.errors import SourceError
+from companion.timing.rate_limit import RateLimit
 from drivers.mavlink.wire.host_address import resolve
 from drivers.mavlink.wire.link_url import Endpoint
-from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
+from drivers.mavlink.wire.send_queue import PacketQueue
 from drivers.mavlink.wire.udp_wire import NETWORK_BYTES_PER_S
 from drivers.mavlink.wire.wire import Wire
 

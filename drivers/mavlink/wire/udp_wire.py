@@ -7,9 +7,10 @@ import struct
 import time
 
 from companion.errors import SourceError
+from companion.timing.rate_limit import RateLimit
 from drivers.mavlink.wire.host_address import resolve
 from drivers.mavlink.wire.link_url import Endpoint
-from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
+from drivers.mavlink.wire.send_queue import PacketQueue
 from drivers.mavlink.wire.wire import Wire, WireEnd
 
 SO_TIMESTAMPNS = 35  # Linux, which Python has no name for

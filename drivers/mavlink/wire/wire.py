@@ -10,7 +10,8 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Protocol
 
 from companion.errors import SourceError
-from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
+from companion.timing.rate_limit import RateLimit
+from drivers.mavlink.wire.send_queue import PacketQueue
 
 FIRST_RETRY_S, MOST_RETRY_S = 0.1, 0.5
 STALLED_NS = 30_000_000_000

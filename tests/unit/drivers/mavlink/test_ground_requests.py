@@ -24,7 +24,7 @@ from drivers.mavlink.ground.command_server import ACCEPTED, Command, CommandServ
 from drivers.mavlink.ground.ground_requests import KINDS, TOO_MANY, GroundRequests
 from drivers.mavlink.ground.mission_server import MissionServer
 from drivers.mavlink.ground.parameter_server import SET, ParameterServer
-from drivers.mavlink.ground.request_limit import EACH_BURST, MOST_ASKERS, RequestLimit
+from drivers.mavlink.ground.request_limit import EACH_BURST, MOST_ASKERS, request_limit
 from drivers.mavlink.status_text import TEXTS_AT_ONCE, WARNINGS_ONLY, TextLimit
 from drivers.mavlink.wire.packet_stream import MavlinkStream, decode
 from tests.support.autopilot.ground_station import asked
@@ -97,11 +97,11 @@ def test_a_storm_is_cut_off_and_named_once() -> None:
 
 
 def test_askers_that_change_their_names_share_what_there_is_for_all() -> None:
-    limit = RequestLimit()
+    limit = request_limit()
     n = sum(limit.allows((n % 250, n // 250), SECOND + n) for n in range(5000))
     assert n <= 301
     assert limit.n_refused == 5000 - n
-    assert len(limit._askers) <= MOST_ASKERS
+    assert len(limit._peers) <= MOST_ASKERS
 
 
 def test_nothing_that_is_sent_breaks_it() -> None:

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
+from companion.timing.rate_limit import RateLimit
+from drivers.mavlink.wire.send_queue import PacketQueue
 
 S = 10**9
 
