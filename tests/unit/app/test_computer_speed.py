@@ -2,6 +2,9 @@ from __future__ import annotations
 
 import dataclasses
 
+import pytest
+
+from companion.app import computer_speed
 from companion.app.computer_speed import (
     CANDIDATES,
     Speed,
@@ -62,7 +65,8 @@ def test_cores_of_the_measured_daemon() -> None:
     assert abs(cores_wanted(speed, 10.0, depth_share=0.1) - 1.03) < 0.02
 
 
-def test_localisation_of_the_sample_flight_is_measured() -> None:
+def test_localisation_of_the_sample_flight_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(computer_speed, "N_FRAMES", computer_speed.N_WARM_UP + 40)
     speed = measured_speed([MeasuredDevice("0:0", "none", "nobody", problem="broken")])
     assert 0.0 < speed.frame_ms <= speed.frame_p95_ms and speed.keyframe_ms > 0.0
     assert 0.1 < speed.keyframes_per_s < 10.0  # the sample has ten frames a second
