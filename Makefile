@@ -10,31 +10,44 @@ OUT ?= out/demo
 # With it each process of the tests, seven a flight, compiles the whole program anew: a second each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint loops opencl clean reference regression settings deb system-test trials docs bench
+.PHONY: demo test lint loops computed flights light opencl clean reference regression settings deb system-test trials docs bench
 
 demo: opencl
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
 
-# First what only computes; then flights in real time, one for each core, which take 0.8 of one
-# and more: three at once on two cores are all late, and take longer than one after the other; last
-# what wants the computer for itself. Files in which one of these fails are run once more, one
-# after the other: a machine that others use too may be too busy for one, and in some files one
-# flight goes through all tests.
+# First what only computes, and the checks of types beside it; then flights in real time, one for
+# each core, which take 0.8 of one and more: three at once on two cores are all late, and take longer
+# than one after the other. Beside them fly those that hardly need a processor. Last what wants the
+# computer for itself. Files in which one of these fails are run once more, one after the other: a
+# machine that others use too may be too busy for one, and in some files one flight goes through all
+# tests.
 test: $(VENV)/.installed-dev opencl
-	$(MAKE) --no-print-directory --jobs=2 lint loops
+	$(MAKE) --no-print-directory --jobs=2 lint computed
+	$(MAKE) --no-print-directory --jobs=2 flights light
+	$(BIN)/pytest tests/system tests/firmware $(ALONE) || $(ONCE_MORE)
+
+computed: loops
 	$(BIN)/pytest -m "not real_time" --ignore tests/live --ignore tests/system -n 3 $(IN_ORDER)
-	$(BIN)/pytest -m "real_time and not alone" tests/live $(REAL_TIME) -n $$(nproc) $(IN_ORDER) || \
+
+flights: $(VENV)/.installed-dev
+	$(BIN)/pytest -m "real_time and not light and not alone" $(FLIGHTS) -n $$(nproc) $(IN_ORDER) || \
 	  $(ONCE_MORE)
-	$(BIN)/pytest tests/system tests/firmware || $(ONCE_MORE)
+
+light: CACHE = -o cache_dir=.pytest_cache/light
+light: $(VENV)/.installed-dev
+	$(BIN)/pytest -m "real_time and light" $(LIGHT) $(CACHE) $(SLOWEST) || $(ONCE_MORE)
 
 # In the order in which they are found, which is that of tests/conftest.py: the longest files first.
 # The slowest tests are named at the end.
-IN_ORDER = --dist loadfile --no-loadscope-reorder --durations 60 --durations-min 2
+IN_ORDER = --dist loadfile --no-loadscope-reorder $(SLOWEST)
+SLOWEST = --durations 60 --durations-min 2
 # Files that are not asked for are not imported: that takes each worker six seconds and more.
-REAL_TIME = $(shell grep -rl --include='test_*.py' real_time tests/unit tests/replay)
-ONCE_MORE = { [ $$? -eq 1 ] && $(BIN)/pytest -m real_time $$($(FAILED_FILES)); }
-FAILED_FILES := $(BIN)/python -c "import json; \
-  failed = json.load(open('.pytest_cache/v/cache/lastfailed')); \
+ALONE = $(shell grep -l mark.alone tests/live/test_*.py)
+LIGHT = $(shell grep -rl --include='test_*.py' real_time tests/unit; grep -l mark.light tests/live/test_*.py)
+FLIGHTS = $(filter-out $(ALONE) $(LIGHT), $(shell ls tests/live/test_*.py; grep -rl real_time --include='test_*.py' tests/replay))
+ONCE_MORE = { [ $$? -eq 1 ] && $(BIN)/pytest -m real_time $(CACHE) $$($(FAILED_FILES)); }
+FAILED_FILES = $(BIN)/python -c "import json; \
+  failed = json.load(open('.pytest_cache/$(if $(CACHE),light/)v/cache/lastfailed')); \
   print(*sorted({name.partition('::')[0] for name in failed}))"
 
 lint: $(VENV)/.installed-dev
@@ -43,7 +56,7 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Compiled once, beside the checks above: else each worker and each flight of the tests does it.
+# Compiled once, before the tests begin: else each worker and each flight of them does it.
 loops: $(VENV)/.installed-dev
 	$(BIN)/python -c "import companion.stages.localisation_work"
 

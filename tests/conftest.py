@@ -19,11 +19,10 @@ import pytest
 
 from tests.support.left_behind import left_since, running, watch_tasks
 from tests.support.processes.steal import FlownAgain
-from tests.support.processes.turns import Turns
 
 LONGEST = (
     "test_two_nodes", "test_flown_by_vision", "test_as_flown", "test_set_up_in_browser",
-    "test_stage_faults", "test_page_in_browser", "test_autopilot_link", "test_whole_flight",
+    "test_stage_faults", "test_page_in_browser", "test_whole_flight",
     "test_recording", "test_service", "test_dead_reckoning", "test_autopilot_faults",
     "test_daemon_limits", "test_ground_control", "test_armed_settings", "test_restart_in_flight",
     "test_device_faults", "test_power_on",
@@ -36,15 +35,17 @@ MARKS = {"live": ("real_time",), "system": ("real_time", "alone")}
 
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(FlownAgain())
-    config.pluginmanager.register(Turns())
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     places = {name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.path.stem, len(places)))
     for item in items:
-        for mark in MARKS.get(item.path.relative_to(Path(__file__).parent).parts[0], ()):
+        kind = item.path.relative_to(Path(__file__).parent).parts[0]
+        for mark in MARKS.get(kind, ()):
             item.add_marker(mark)
+        if kind == "unit" and item.get_closest_marker("real_time") is not None:
+            item.add_marker("light")
 
 
 @pytest.hookimpl(tryfirst=True)

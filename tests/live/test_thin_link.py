@@ -14,6 +14,7 @@ from tests.support.processes.link_trial import Trial, fly
 from tests.support.processes.two_namespaces import TwoNamespaces, why_not
 from tests.unit.streaming.test_viewer_recording import CAMERA
 
+pytestmark = pytest.mark.light
 KBIT_S, DELAY_MS, LOSS, BUDGET_KBIT_S = 1000, 50, 0.02, 800
 SECONDS, CUT_S, BACK_S = 22.0, 8.0, 12.0
 
