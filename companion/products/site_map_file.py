@@ -32,10 +32,12 @@ from companion.products.site_map_rows import (
     head_of,
     keyframe_json,
     keyframe_of,
+    packed,
     part_json,
     point_arrays,
     point_rows,
     site_part_of,
+    unpacked,
 )
 from companion.slam.map.site_map import SiteMap
 from companion.slam.map.sparse_map import Keyframe
@@ -44,8 +46,8 @@ SITE_MAP = "site.map"
 """Its name in the folder of a run."""
 APPLICATION_ID = 0x534D4150
 """SQLite's application_id: SMAP."""
-VERSION = 1
-"""SQLite's user_version; a newer one is refused."""
+VERSION = 2
+"""SQLite's user_version; a newer one is refused. Rows of version 1 are not packed."""
 BLOCK = 1024
 """Points in a row."""
 DIGEST_BYTES = 16
@@ -97,11 +99,11 @@ def write_site_map(path: Path, site: SiteMap) -> None:
             for n, each in enumerate(site.parts):
                 file.execute("INSERT INTO part VALUES (?, ?, ?)", (n, *_signed(part_json(each))))
             for key, which in zip(site.keyframes, site.part_of.tolist(), strict=True):
-                text, data = keyframe_json(key), feature_rows(key).tobytes()
+                text, data = keyframe_json(key), packed(feature_rows(key))
                 row = (key.keyframe_id, which, text, data, _digest(which, text, data))
                 file.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?, ?)", row)
             for first in range(0, len(site.points.positions), BLOCK):
-                data = point_rows(site, slice(first, first + BLOCK)).tobytes()
+                data = packed(point_rows(site, slice(first, first + BLOCK)))
                 block = (first, data, _digest(first, data))
                 file.execute("INSERT INTO points VALUES (?, ?, ?)", block)
             file.execute("COMMIT")
@@ -227,16 +229,31 @@ def _row(file: sqlite3.Connection, query: str, key: int) -> Any:
         return None
 
 
+def _rows(
+    file: sqlite3.Connection, data: bytes, of: np.dtype[np.void], most: int
+) -> NDArray[np.void] | None:
+    """Rows of their bytes, `most` at most; None where they are none."""
+    (version,) = file.execute("PRAGMA user_version").fetchone()
+    try:
+        rows = np.frombuffer(data, of) if version == 1 else unpacked(data, of, most)
+    except ValueError:
+        return None
+    return rows if len(rows) <= most else None
+
+
 def _points(file: sqlite3.Connection, head: SiteHead, damaged: list[str]) -> NDArray[np.void]:
     rows = np.zeros(head.n_points, POINT)
     for first in range(0, head.n_points, BLOCK):
         row = _row(file, "SELECT data, digest FROM points WHERE id = ?", first)
         own = rows[first : first + BLOCK]
-        if row is None or len(row[0]) != own.nbytes or _digest(first, row[0]) != row[1]:
+        found = None
+        if row is not None and _digest(first, row[0]) == row[1]:
+            found = _rows(file, row[0], POINT, BLOCK)
+        if found is None or len(found) != len(own):
             damaged.append(f"points {first} to {first + len(own) - 1}")
             own["positions"] = np.nan
         else:
-            own[:] = np.frombuffer(row[0], POINT)
+            own[:] = found
     return rows
 
 
@@ -246,10 +263,10 @@ def _keyframe(
     """A keyframe and its part; None where it is damaged."""
     query = "SELECT part, json, features, digest FROM keyframe WHERE id = ?"
     row = _row(file, query, key)
-    if row is None or _digest(*row[:3]) != row[3] or len(row[2]) % FEATURE.itemsize:
+    if row is None or _digest(*row[:3]) != row[3]:
         return None
-    part, said, rows = row[0], json.loads(row[1]), np.frombuffer(row[2], FEATURE)
-    if not 0 <= part < len(head.parts) or not 0 < len(rows) <= MAX_FEATURES:
+    part, said, rows = row[0], json.loads(row[1]), _rows(file, row[2], FEATURE, MAX_FEATURES)
+    if rows is None or not len(rows) or not 0 <= part < len(head.parts):
         return None
     if rows["point_ids"].max() >= n_points:
         return None

@@ -17,12 +17,14 @@ from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Similarity, yaw_rotation
 from companion.products.site_map_file import (
     SITE_MAP,
+    VERSION,
     SiteMapError,
     _digest,
     read_head,
     read_site_map,
     write_site_map,
 )
+from companion.products.site_map_rows import FEATURE, POINT, packed, unpacked
 from companion.slam.map.site_map import (
     SiteGeoreference,
     SiteMap,
@@ -186,9 +188,51 @@ def test_no_damage_is_taken_for_a_map(path: Path, seed: int) -> None:
 
 def test_a_newer_version_is_refused_in_words(path: Path) -> None:
     with closing(sqlite3.connect(path)) as file:
-        file.execute("PRAGMA user_version = 2")
-    with pytest.raises(SiteMapError, match="version 2"):
+        file.execute(f"PRAGMA user_version = {VERSION + 1}")
+    with pytest.raises(SiteMapError, match=f"version {VERSION + 1}"):
         read_head(path)
+
+
+def test_the_version_before_is_read_the_same(path: Path) -> None:
+    new = read_site_map(path).site
+    with closing(sqlite3.connect(path)) as file:
+        file.execute("PRAGMA user_version = 1")
+        for key, part, said, data in file.execute(
+            "SELECT id, part, json, features FROM keyframe"
+        ).fetchall():
+            rows = unpacked(data, FEATURE, 10_000).tobytes()
+            file.execute(
+                "UPDATE keyframe SET features = ?, digest = ? WHERE id = ?",
+                (rows, _digest(part, said, rows), key),
+            )
+        for first, data in file.execute("SELECT id, data FROM points").fetchall():
+            rows = unpacked(data, POINT, 10_000).tobytes()
+            file.execute(
+                "UPDATE points SET data = ?, digest = ? WHERE id = ?",
+                (rows, _digest(first, rows), first),
+            )
+        file.commit()
+    old = read_site_map(path)
+    assert not old.damaged
+    for a, b in zip(old.site.points, new.points, strict=True):
+        np.testing.assert_array_equal(a, b)
+    for one, other in zip(old.site.keyframes, new.keyframes, strict=True):
+        np.testing.assert_array_equal(one.normalised, other.normalised)
+        np.testing.assert_array_equal(one.features.descriptors, other.features.descriptors)
+
+
+def test_rows_come_back_from_few_bytes_and_not_more_than_are_due() -> None:
+    rows = np.zeros(1000, FEATURE)
+    rows["descriptors"] = np.random.default_rng(1).integers(0, 256, (1000, 32))
+    rows["point_ids"] = np.arange(1000)
+    data = packed(rows)
+    assert len(data) < 0.8 * rows.nbytes
+    np.testing.assert_array_equal(unpacked(data, FEATURE, 1000), rows)
+    for wrong in (data[:-20], b"Dear all", data + b"."):
+        with pytest.raises(ValueError, match="rows|header"):
+            unpacked(wrong, FEATURE, 1000)
+    with pytest.raises(ValueError, match="rows"):
+        unpacked(data, FEATURE, 999)
 
 
 def test_what_is_no_map_is_refused(tmp_path: Path) -> None:
