@@ -19,7 +19,8 @@ def change_numbers(found: SiteComparison, origin: GeoOrigin | None) -> dict[str,
     return {
         "origin": None if origin is None else
             [origin.latitude_deg, origin.longitude_deg, origin.altitude_m],
-        "points_of_both": found.n_shared, "apart_m": round(found.apart_m, 4),
+        "points_of_both": found.n_shared,
+        "apart_m": None if found.apart_m is None else round(found.apart_m, 4),
         "points": list(found.n_points), "points_at_places_seen_by_both": list(found.n_looked),
         "changes": [_numbers(each) for each in found.changes],
     }  # fmt: skip

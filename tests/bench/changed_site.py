@@ -103,6 +103,7 @@ def main() -> None:
     before, after = (site(options.work, options.seed, later) for later in (False, True))
     found = compare_sites(before, after, Similarity.identity())
     assert found is not None
+    assert found.apart_m is not None
     print(f"{found.n_shared} points of both, {100 * found.apart_m:.1f} cm apart")
     unclaimed = list(found.changes)
     for kind, size, height, there, then, _ in THINGS:

@@ -45,6 +45,11 @@ def compare_maps(path_a: Path, path_b: Path, out: Path | None) -> SiteComparison
 
 def changes_in_words(found: SiteComparison) -> str:
     """A line about the comparison, and one for each change."""
+    if found.apart_m is None:
+        return (
+            f"{found.n_shared} points in both maps: too few to tell how far these are apart, and "
+            "so what has changed"
+        )
     lines = [
         f"{found.n_shared} points in both maps, {found.apart_m:.3f} m apart (one axis); looked at "
         f"again: {found.n_looked[0]} of {found.n_points[0]} points of A, {found.n_looked[1]} of "

@@ -28,14 +28,14 @@ class MergedFlight:
     """Share of one flight in a map: its keyframes, and the points that they observe.
 
     Of these `n_shared` are observed by other flights too, from which it is `apart_m` away there:
-    one standard deviation, of one axis.
+    one standard deviation, of one axis; None where they are too few to tell.
     """
 
     flight: str
     n_keyframes: int
     n_points: int
     n_shared: int
-    apart_m: float
+    apart_m: float | None
 
 
 @dataclass(frozen=True, slots=True)

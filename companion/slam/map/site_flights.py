@@ -14,6 +14,10 @@ from companion.slam.map.sparse_map import Keyframe
 ROBUST = 1.4826
 """Standard deviation by the median of absolute values, of normal errors."""
 
+MIN_SHARED = 10
+"""Points on which a disagreement is told: of thirty numbers the median absolute value is certain to
+a fifth."""
+
 
 class SiteFlight:
     """Some keyframes of a site map, and by how many of them each point is observed."""
@@ -31,16 +35,17 @@ class SiteFlight:
         return np.stack([k.centre for k in self.keyframes])
 
 
-def disagreement_m(site: SiteMap, a: SiteFlight, b: SiteFlight) -> tuple[float, int]:
+def disagreement_m(site: SiteMap, a: SiteFlight, b: SiteFlight) -> tuple[float | None, int]:
     """Standard deviation, of one axis, by which two flights disagree, and on how many points.
 
     Of each point that both observe, the place by the keyframes of each flight alone is compared.
-    0 m on no points.
+    None where there are too few of them to tell.
     """
     shared = np.flatnonzero((a.n_observers >= 2) & (b.n_observers >= 2))
     off = _shifts_alone(site, a.keyframes, shared) - _shifts_alone(site, b.keyframes, shared)
     off = off[np.isfinite(off).all(1)]
-    return (float(ROBUST * np.median(np.abs(off))), len(off)) if len(off) else (0.0, 0)
+    told = len(off) >= MIN_SHARED
+    return float(ROBUST * np.median(np.abs(off))) if told else None, len(off)
 
 
 def _shifts_alone(site: SiteMap, keyframes: Sequence[Keyframe], ids: Ints) -> Array:

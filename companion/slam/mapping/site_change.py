@@ -68,13 +68,13 @@ class SiteChange:
 class SiteComparison:
     """Changes from one map to another; all in the world of the first.
 
-    `apart_m` is the standard deviation, of one axis, by which the maps disagree on points that
-    both observe, and `n_shared` the number of these. `n_looked` are points of each map at places
-    that the other flight saw; of all others nothing is known.
+    `apart_m` is the standard deviation, of one axis, by which the maps disagree on the `n_shared`
+    points that both observe; None where they are too few, and no change is told then. `n_looked`
+    are points of each map at places that the other flight saw; of all others nothing is known.
     """
 
     changes: tuple[SiteChange, ...]
-    apart_m: float
+    apart_m: float | None
     n_shared: int
     n_points: tuple[int, int]
     n_looked: tuple[int, int]
@@ -95,6 +95,10 @@ def changes_in(both: SiteMap, n_before: int) -> SiteComparison:
     is_before: Bools = both.part_of < n_before
     flights = SiteFlight(both, is_before), SiteFlight(both, ~is_before)
     off_m, n_shared = disagreement_m(both, *flights)
+    before, after = flights
+    n_points = _n_believed(before), _n_believed(after)
+    if off_m is None:
+        return SiteComparison((), None, n_shared, n_points, (0, 0), before.path_m, after.path_m)
     things, n_looked = [], []
     for own, other in (flights, flights[::-1]):
         candidates = np.flatnonzero(
@@ -107,11 +111,9 @@ def changes_in(both: SiteMap, n_before: int) -> SiteComparison:
         )
         n_looked.append(int(np.count_nonzero(seen.n_through + seen.n_confirming)) + n_shared)
         things.append(_things(both, own, candidates[seen.gone], seen.n_through[seen.gone]))
-    before, after = flights
     return SiteComparison(
-        _with_moved(both, things[0], things[1], off_m), off_m, n_shared,
-        (_n_believed(before), _n_believed(after)), (n_looked[0], n_looked[1]),
-        before.path_m, after.path_m,
+        _with_moved(both, things[0], things[1], off_m), off_m, n_shared, n_points,
+        (n_looked[0], n_looked[1]), before.path_m, after.path_m,
     )  # fmt: skip
 
 

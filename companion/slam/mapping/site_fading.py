@@ -32,6 +32,8 @@ def faded(site: SiteMap) -> SiteMap:
         if not later.keyframes or not len(candidates):
             continue
         off_m, _ = disagreement_m(site, SiteFlight(site, site.part_of < part), later)
+        if off_m is None:  # how well the flight lies in the map is not known
+            continue
         told = looked_through(
             later.keyframes, site.points.positions, site.covariances, candidates, off_m
         )

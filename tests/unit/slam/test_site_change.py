@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 from companion.app.cli import main
+from companion.app.maps.compare_maps import changes_in_words, compare_maps
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.products.site_map_file import write_site_map
 from companion.slam.map.map_points import PointArrays
 from companion.slam.map.site_map import SiteGeoreference, SiteMap, SitePart, site_map_of
-from companion.slam.mapping.site_change import SiteComparison, compare_sites
+from companion.slam.mapping.site_change import SiteComparison, changes_in, compare_sites
 from companion.slam.mapping.site_fading import faded
+from companion.slam.mapping.site_merge import merge_sites
 from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
 
 IN_ITSELF = Similarity.identity()
@@ -92,17 +94,15 @@ def test_a_thing_where_the_other_flight_did_not_look_is_no_change() -> None:
     assert compared(before, left_out).changes == ()
 
 
-def test_what_later_flights_look_through_fades_from_a_map() -> None:
-    before, after = ground(), ground()
-    box(before, THERE, 1)
-    old, new = site(before, "before"), site(after, "after", back=True)
+def side_by_side(old: SiteMap, new: SiteMap) -> SiteMap:
+    """Two maps as one, without a point that both observe."""
     n_old, offset = len(old.keyframes), len(old.points.positions)
     later = tuple(
         replace(k, keyframe_id=k.keyframe_id + n_old,
                 point_ids=np.where(k.point_ids >= 0, k.point_ids + offset, -1))
         for k in deepcopy(new.keyframes)
     )  # fmt: skip
-    both = replace(
+    return replace(
         old, parts=(*old.parts, *new.parts), keyframes=(*old.keyframes, *later),
         part_of=np.r_[old.part_of, new.part_of + 1],
         points=PointArrays._make(
@@ -110,6 +110,32 @@ def test_what_later_flights_look_through_fades_from_a_map() -> None:
         ),
         covariances=np.concatenate([old.covariances, new.covariances]),
     )  # fmt: skip
+
+
+def test_where_no_point_is_observed_by_both_nothing_is_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, after = ground(), ground()
+    box(before, THERE, 1)
+    both = side_by_side(site(before, "before"), site(after, "after", back=True))
+    found = changes_in(both, 1)
+    assert found.apart_m is None and found.changes == () and found.n_looked == (0, 0)
+    assert "too few" in changes_in_words(found)
+    assert faded(both) is both
+    monkeypatch.setattr("companion.app.maps.compare_maps.compare_sites", lambda *_: found)
+    path = tmp_path / "site.map"
+    write_site_map(path, both)
+    compare_maps(path, path, tmp_path)
+    assert json.loads((tmp_path / "changes.json").read_text())["apart_m"] is None
+    assert "What has changed is not known" in (tmp_path / "changes.html").read_text()
+
+
+def test_what_later_flights_look_through_fades_from_a_map() -> None:
+    before, after = ground(), ground()
+    box(before, THERE, 1)
+    old, new = site(before, "before"), site(after, "after", back=True)
+    both = merge_sites(old, new, IN_ITSELF)
+    assert both is not None
     left = faded(both)
     tops = [int((s.points.positions[:, 2] < -2.5).sum()) for s in (both, left)]
     assert tops[0] > 40 and tops[1] < 0.2 * tops[0]
