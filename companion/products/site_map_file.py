@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import InputError
+from companion.products.array_file import ArrayFile
 from companion.products.atomic_file import sync
 from companion.products.site_map_rows import (
     FEATURE,
@@ -41,6 +42,7 @@ from companion.products.site_map_rows import (
 )
 from companion.slam.map.site_map import SiteMap
 from companion.slam.map.sparse_map import Keyframe
+from companion.slam.mapping.far_keyframes import put_away
 
 SITE_MAP = "site.map"
 """Its name in the folder of a run."""
@@ -131,8 +133,11 @@ def read_head(path: Path) -> SiteHead:
         return _head_of(path, file)
 
 
-def read_site_map(path: Path) -> ReadSiteMap:
-    """Read a site map as far as it is whole; SiteMapError where nothing of it can be used."""
+def read_site_map(path: Path, far: ArrayFile | None = None) -> ReadSiteMap:
+    """Read a site map as far as it is whole; SiteMapError where nothing of it can be used.
+
+    With `far`, features and patches go there, as far as it takes them, not into memory.
+    """
     with closing(_opened(path)) as file:
         head = _head_of(path, file)
         damaged: list[str] = []
@@ -144,6 +149,8 @@ def read_site_map(path: Path) -> ReadSiteMap:
             if found is None:
                 damaged.append(f"keyframe {n}")
             else:
+                if far is not None:
+                    put_away(found[0], far)
                 keyframes.append(found[0])
                 part_of.append(found[1])
     if not keyframes:
@@ -152,10 +159,14 @@ def read_site_map(path: Path) -> ReadSiteMap:
     for keyframe in keyframes:  # what observes a point of a lost block observes none
         ids = keyframe.point_ids
         ids[(ids >= 0) & lost[ids]] = -1
+    points = point_arrays(rows)
+    kept = None if far is None else far.put([points.patch_grey])
+    if kept is not None:
+        points = points._replace(patch_grey=kept[0])
     site = SiteMap(
         head.revision, head.parts, tuple(keyframes), np.array(part_of, np.int64),
-        point_arrays(rows), covariances_of(rows), head.georeference,
-        head.scale_factor, head.n_levels,
+        points, covariances_of(rows), head.georeference,
+        head.scale_factor, head.n_levels, is_in_file=kept is not None,
     )  # fmt: skip
     return ReadSiteMap(site, tuple(damaged))
 

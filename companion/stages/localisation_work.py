@@ -69,11 +69,12 @@ class _Localisation(Work):
         self._said: list[tuple[str, str]] = []
         self._site_used: SiteMapUsed | None = None
         """Told with the first frame."""
+        self._far = ArrayFile(setup.folder or Path(setup.config.daemon.flights))
         self._stage = LocalisationStage(
             setup.config, setup.camera, self.times, background=setup.is_live, site=self._site(setup)
         )
-        self._far = ArrayFile(setup.folder or Path(setup.config.daemon.flights))
         self._stage.put_far_into(self._far)
+        self._far.forget()
         self._is_far_fault_said = False
         if setup.is_live:  # in a process of its own; of the compiler of loops nothing is needed now
             give_back_heap()
@@ -91,7 +92,7 @@ class _Localisation(Work):
             return None
         path = map_path(setup.config.map.use).absolute()
         try:
-            read, digest = read_site_map(path), digest_of(path)
+            read, digest = read_site_map(path, self._far), digest_of(path)
             features = setup.config.features
             if (read.site.scale_factor, read.site.n_levels) != (
                 features.scale_factor, features.n_levels,

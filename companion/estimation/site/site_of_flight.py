@@ -10,14 +10,20 @@ from companion.estimation.georeference.trajectory_alignment import DRIFT_TAU_S, 
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import Georeference
-from companion.slam.map.site_map import SiteGeoreference, SiteMap, SitePart, site_map_of
+from companion.slam.map.site_map import (
+    SiteAccount,
+    SiteGeoreference,
+    SiteMap,
+    SitePart,
+    site_map_of,
+)
 from companion.slam.map.sparse_map import SlamMap
 from companion.slam.mapping.site_fading import faded
 
 
 def site_of_flight(
     segments: Sequence[tuple[SlamMap, Georeference]], camera: Camera, flight: str,
-    origin: GeoOrigin | None, used: SiteMap | None,
+    origin: GeoOrigin | None, used: SiteAccount | None,
 ) -> SiteMap | None:  # fmt: skip
     """The site map of the largest of some maps; None of none.
 
@@ -29,10 +35,7 @@ def site_of_flight(
         return None
     segment, placed = max(segments, key=lambda each: len(each[0].keyframes))
     before = used if segment.held and used is not None else None
-    part_of_id: dict[int, int] = {}
-    if before is not None:
-        ids = [k.keyframe_id for k in before.keyframes]
-        part_of_id = dict(zip(ids, before.part_of.tolist(), strict=True))
+    part_of_id = {} if before is None else before.part_of_id
     times = [k.t_ns for key, k in segment.keyframes.items() if key not in part_of_id]
     parts = () if before is None else before.parts
     revision = 1 if before is None else before.revision + 1
@@ -48,7 +51,7 @@ def site_of_flight(
 
 
 def _origin(
-    of_flight: GeoOrigin | None, placed: Georeference, before: SiteMap | None
+    of_flight: GeoOrigin | None, placed: Georeference, before: SiteAccount | None
 ) -> GeoOrigin | None:
     """Origin of the world that a map lies in; where it was merged, that is as the earlier one."""
     if before is None:

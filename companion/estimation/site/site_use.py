@@ -11,7 +11,7 @@ from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned, ned_from_ge
 from companion.geometry.transforms import Array, Similarity
 from companion.messages import Georeference, Warned
 from companion.slam.loop.loop_closure import LoopClosure
-from companion.slam.map.site_map import SiteMap, slam_map_of
+from companion.slam.map.site_map import SiteAccount, SiteMap, slam_map_of
 from companion.slam.map.sparse_map import SlamMap
 
 MAX_OFF_M = 20.0
@@ -38,7 +38,8 @@ class SiteUse:
     def __init__(
         self, site: SiteMap, camera: Camera, origin: GeoOrigin | None, is_live: bool = False
     ) -> None:
-        self.site = site
+        self.site = site.account
+        """Keyframes and points are in `slam_map`, and grow old in it."""
         self.slam_map: SlamMap = slam_map_of(site, camera)
         self.located = self.misplaced = False
         self._n_off = 0
@@ -60,14 +61,14 @@ class SiteUse:
         found = self.site.georeference
         return Georeference(
             self._world_from_site, found.sigma_scale, found.sigma_yaw_rad,
-            f"the map of {self.site.parts[0].flight} ({found.method})", len(self.site.keyframes),
+            f"the map of {self.site.parts[0].flight} ({found.method})", len(self.site.part_of_id),
             found.sigma_m, has_origin=not self.misplaced and (
                 self._has_both or (found.origin is not None and not self._is_live)
             ),
         )  # fmt: skip
 
     @property
-    def left(self) -> SiteMap:
+    def left(self) -> SiteAccount:
         """The map, as the flight is to leave it: without a place where satellites contradict it."""
         found = self.site.georeference
         return (
@@ -143,7 +144,7 @@ class SiteUse:
         """Note that the flight was found in the map."""
         self.located = True
         parts = ", ".join(part.flight for part in self.site.parts)
-        self._say(LOCATED, f"{parts}: {len(self.site.keyframes)} keyframes")
+        self._say(LOCATED, f"{parts}: {len(self.site.part_of_id)} keyframes")
 
     def _say(self, what: str, detail: str) -> None:
         if what not in self._said:

@@ -27,8 +27,9 @@ def merge_maps(here: SlamMap, there: SlamMap, here_from_there: Similarity) -> No
     there_from_here = here_from_there.inverse()
     for key, keyframe in there.keyframes.items():
         keyframe.camera_from_map = camera_from_there(keyframe.camera_from_map, there_from_here)
-        keyframe.point_ids = np.where(keyframe.point_ids >= 0, keyframe.point_ids + offset, -1)
-        keyframe.refined_for = np.full(len(keyframe.features), -1)  # by ids of the other map
+        ids = keyframe.point_ids
+        keyframe.point_ids = np.where(ids >= 0, ids + ids.dtype.type(offset), ids)
+        keyframe.refined_for = np.full_like(ids, -1)  # by ids of the other map
         here.keyframes[key] = keyframe
         here.unit_of[key] = there.unit_of.get(key, 1.0) * here_from_there.scale
     for key, retired in there.retired.items():

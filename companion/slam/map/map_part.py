@@ -31,6 +31,8 @@ class MapPart:
     level: bool
     keyframes: tuple[Keyframe, ...]
     points: PointArrays
+    is_far: bool = False
+    """Patches lie in a file, or may: they are read where they are."""
 
 
 def part_around(slam_map: SlamMap, keyframe: Keyframe, most_bytes: int) -> MapPart:
@@ -93,7 +95,7 @@ def map_of(part: MapPart, scale_factor: float, n_levels: int, shift_ns: int = 0)
     slam_map = SlamMap(
         scale_factor, n_levels, first_keyframe_id=part.first_keyframe_id, level=part.level
     )
-    slam_map.load_points(part.points)
+    slam_map.load_points(part.points, part.is_far)
     for kept in part.keyframes:
         keyframe = replace(kept, t_ns=kept.t_ns + shift_ns, point_ids=kept.point_ids.copy())
         slam_map.keyframes[keyframe.keyframe_id] = keyframe

@@ -147,12 +147,11 @@ class MapPoints:
         self.normals[new] = self.normals[new] @ own_from_other.rotation.T
         self.base_distance[new] *= own_from_other.scale
         self.n_points += n
-        held = np.flatnonzero(other.patch_at[:n] != NO_PATCH)
-        self.patch_at[offset + held] = self.patches.add(other.patches.of(other.patch_at[held]))
+        self.patch_at[new] = self.patches.take_over(other.patches, other.patch_at[:n])
         return offset
 
-    def load_points(self, points: PointArrays) -> None:
-        """Load stored points (see `points_of`) into an empty map."""
+    def load_points(self, points: PointArrays, is_far: bool = False) -> None:
+        """Load stored points (see `points_of`) into an empty map; of far ones the patches stay."""
         n = len(points.positions)
         self._reserve(n)
         self.n_points = n
@@ -162,7 +161,10 @@ class MapPoints:
                 getattr(self, name)[every] = values
         self.alive[every] = True
         self.observers[every] = -1
-        self.patch_at[every] = self.patches.add(points.patch_grey)
+        if is_far:
+            self.patch_at[every] = self.patches.put_away(np.full(n, NO_PATCH), points.patch_grey)
+        else:
+            self.patch_at[every] = self.patches.add(points.patch_grey)
 
     def points_of(self, ids: Ints) -> PointArrays:
         """Copies of the data of living points, without their observations."""

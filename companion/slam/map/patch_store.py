@@ -18,7 +18,8 @@ LEAST_ROWS = 4096
 class PatchStore:
     """Patches (24, 24) u8 by number: from 0 in `near`, below NO_PATCH in arrays put away."""
 
-    near: Bytes = field(default_factory=lambda: np.zeros((0, STORED, STORED), np.uint8))
+    near: Bytes = field(default_factory=lambda: np.zeros((1, STORED, STORED), np.uint8))
+    """The last row is looked at for NO_PATCH."""
     _free: list[int] = field(default_factory=list)
     _far: list[Bytes] = field(default_factory=list)
     _far_begins: list[int] = field(default_factory=lambda: [0])
@@ -54,10 +55,25 @@ class PatchStore:
                 grey[own] = self._far[k][at[own] - self._far_begins[k]]
         return grey
 
+    def take_over(self, other: PatchStore, numbers: Ints) -> Ints:
+        """Patches of another store, which is invalid afterwards; their numbers here."""
+        out = numbers - self._far_begins[-1]
+        near = numbers >= 0
+        out[near] = self.add(other.near[numbers[near]])
+        out[numbers == NO_PATCH] = NO_PATCH
+        for grey in other._far:
+            self._keep_far(grey)
+        return out
+
     def put_away(self, numbers: Ints, grey: Bytes) -> Ints:
         """Free the rows of near patches, which are in an array `grey` from now on; new numbers."""
         self.free(numbers)
+        first = self._keep_far(grey)
+        return NO_PATCH - 1 - np.arange(first, first + len(grey))
+
+    def _keep_far(self, grey: Bytes) -> int:
+        """Keep an array of far patches; the number of those before it."""
         first = self._far_begins[-1]
         self._far.append(grey)
         self._far_begins.append(first + len(grey))
-        return NO_PATCH - 1 - np.arange(first, first + len(grey))
+        return first

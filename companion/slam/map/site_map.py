@@ -15,7 +15,7 @@ from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Floats
-from companion.slam.features.orb_features import Ints
+from companion.slam.features.orb_features import Features, Ints
 from companion.slam.map.map_part import MapPart, map_of, part_of
 from companion.slam.map.map_points import PointArrays
 from companion.slam.map.sparse_map import Keyframe, SlamMap
@@ -56,12 +56,23 @@ class SiteGeoreference:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SiteAccount:
+    """A site map but for its keyframes and points: `part_of_id` is the part of each keyframe."""
+
+    revision: int
+    parts: tuple[SitePart, ...]
+    part_of_id: Mapping[int, int]
+    georeference: SiteGeoreference
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SiteMap:
     """Keyframes in order of id, which is their index; `point_ids` index `points`.
 
     `part_of` (K,) is the index in `parts` of each keyframe, `covariances` (P, 3, 3) are of the
     points with all poses known, m2, nan where fewer than two keyframes observe one. Times are of
-    each flight's own clock.
+    each flight's own clock. Of one in a file, features and patches may lie there, and are not
+    changed.
     """
 
     revision: int
@@ -73,6 +84,14 @@ class SiteMap:
     georeference: SiteGeoreference
     scale_factor: float
     n_levels: int
+    is_in_file: bool = False
+
+    @property
+    def account(self) -> SiteAccount:
+        """What is left to be known once it is in use."""
+        ids = (k.keyframe_id for k in self.keyframes)
+        part_of_id = dict(zip(ids, self.part_of.tolist(), strict=True))
+        return SiteAccount(self.revision, self.parts, part_of_id, self.georeference)
 
 
 def site_map_of(
@@ -124,19 +143,31 @@ def slam_map_of(site: SiteMap, camera: Camera) -> SlamMap:
     # attitudes of another flight had another mount and heading: what is known now corrects none
     earlier = tuple(
         replace(
-            k, ned_from_camera=None, normalised=k.normalised.copy(), whitening=k.whitening.copy(),
-            refined_for=k.refined_for.copy(),
-            features=replace(k.features, pixels=pixels_of(camera, k.normalised)),
+            k, ned_from_camera=None,
+            normalised=k.normalised if k.is_far else k.normalised.copy(),
+            whitening=k.whitening if k.is_far else k.whitening.copy(),
+            refined_for=k.refined_for if k.is_far else k.refined_for.copy(),
+            features=_seen_by(camera, k),
         )
         for k in site.keyframes
     )  # fmt: skip
     first = earlier[0].keyframe_id if earlier else NO_KEYFRAME
-    whole = MapPart(first, True, earlier, points)
+    whole = MapPart(first, True, earlier, points, site.is_in_file)
     slam_map = map_of(whole, site.scale_factor, site.n_levels, -EARLIER_NS)
     slam_map.held = frozenset(slam_map.keyframes)
     counted = slam_map.n_observers[: slam_map.n_points]
     slam_map.alive[: slam_map.n_points] = counted >= 2  # of a map that was read in part
+    for keyframe in slam_map.keyframes.values():
+        if keyframe.is_far:
+            slam_map.leave_behind(keyframe)
     return slam_map
+
+
+def _seen_by(camera: Camera, keyframe: Keyframe) -> Features:
+    """Features as a camera sees them; where that is the same one, as they are."""
+    pixels = pixels_of(camera, keyframe.normalised)
+    same = np.array_equal(pixels, keyframe.features.pixels)
+    return keyframe.features if same else replace(keyframe.features, pixels=pixels)
 
 
 def of_this_flight(part: MapPart) -> MapPart | None:

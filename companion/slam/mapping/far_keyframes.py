@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from companion.slam.map.patch_store import NO_PATCH
-from companion.slam.map.sparse_map import SlamMap
+from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping.mapping_worker import MapLock
 
 N_NEAR = 400
@@ -34,6 +34,26 @@ class ArrayFile(Protocol):
         """Equal arrays, which are read from the file as they are used; None where it is full."""
 
 
+def put_away(keyframe: Keyframe, file: ArrayFile) -> None:
+    """Keep the features of a keyframe that nothing changes any more in a file, if it takes them."""
+    kept = file.put(_arrays_of(keyframe))
+    if kept is not None:
+        _replace_arrays(keyframe, kept)
+        keyframe.is_far = True
+
+
+def _arrays_of(keyframe: Keyframe) -> list[Any]:
+    features = (getattr(keyframe.features, name) for name in OF_FEATURES)
+    return [*features, keyframe.normalised, keyframe.whitening, keyframe.refined_for]
+
+
+def _replace_arrays(keyframe: Keyframe, kept: Sequence[Any]) -> None:
+    *of_features, keyframe.normalised, keyframe.whitening, keyframe.refined_for = kept
+    keyframe.features = replace(
+        keyframe.features, **dict(zip(OF_FEATURES, of_features, strict=True))
+    )
+
+
 def leave_behind(slam_map: SlamMap, file: ArrayFile | None, map_lock: MapLock) -> None:
     """Put away what is left behind, the newest first, with the lock held but for the writing."""
     for key in list(islice(reversed(slam_map.keyframes), N_NEAR, N_NEAR + MOST_AT_ONCE)):
@@ -43,15 +63,10 @@ def leave_behind(slam_map: SlamMap, file: ArrayFile | None, map_lock: MapLock) -
         slam_map.leave_behind(keyframe)
         _, points = slam_map.observations_of(keyframe)
         points = np.unique(points[slam_map.patch_at[points] > NO_PATCH])
-        features = keyframe.features
-        arrays = (
-            *(getattr(features, name) for name in OF_FEATURES), keyframe.normalised,
-            keyframe.whitening, keyframe.refined_for, slam_map.patches_of(points).grey,
-        )  # fmt: skip
+        arrays = [*_arrays_of(keyframe), slam_map.patches_of(points).grey]
         with map_lock.released():  # only mapping changes old keyframes and patches of their points
             kept = None if file is None else file.put(arrays)
         if kept is None:
             continue
-        *of_features, keyframe.normalised, keyframe.whitening, keyframe.refined_for, grey = kept
-        keyframe.features = replace(features, **dict(zip(OF_FEATURES, of_features, strict=True)))
-        slam_map.put_patches_away(points, grey)
+        _replace_arrays(keyframe, kept[:-1])
+        slam_map.put_patches_away(points, kept[-1])

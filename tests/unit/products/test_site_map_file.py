@@ -229,7 +229,7 @@ def test_rows_come_back_from_few_bytes_and_not_more_than_are_due() -> None:
     assert len(data) < 0.8 * rows.nbytes
     np.testing.assert_array_equal(unpacked(data, FEATURE, 1000), rows)
     for wrong in (data[:-20], b"Dear all", data + b"."):
-        with pytest.raises(ValueError, match="rows|header"):
+        with pytest.raises(ValueError, match=r"rows|header"):
             unpacked(wrong, FEATURE, 1000)
     with pytest.raises(ValueError, match="rows"):
         unpacked(data, FEATURE, 999)

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.geometry.transforms import Similarity
+from companion.geometry.transforms import Similarity, yaw_rotation
 from companion.products.array_file import ArrayFile
+from companion.products.site_map_file import read_site_map, write_site_map
 from companion.slam.features.orb_features import Ints
 from companion.slam.features.patches import image_levels
 from companion.slam.loop.loop_closure import LoopDetector
@@ -19,6 +20,8 @@ from companion.slam.loop.map_merge import close_loop, loop_graph, merge_maps
 from companion.slam.loop.place_recognition import KeyframeDatabase
 from companion.slam.loop.relocalizer import Relocalizer
 from companion.slam.map.map_part import part_of
+from companion.slam.map.patch_store import NO_PATCH
+from companion.slam.map.site_map import SiteGeoreference, SitePart, site_map_of, slam_map_of
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping import far_keyframes
 from companion.slam.mapping.far_keyframes import leave_behind
@@ -28,6 +31,7 @@ from tests.support.reference.synthetic_map import CAMERA, GREY, Ground, bend, fl
 
 CORNERS = [(0.0, 0.0), (16.0, 0.0), (16.0, 16.0), (0.0, 16.0), (0.0, 1.0)]
 N_NEAR = 6
+TO_WORLD = Similarity(2.5, yaw_rotation(0.4), np.array([10.0, -20.0, -30.0]))
 
 
 class Full:
@@ -128,6 +132,47 @@ def test_maps_in_the_file_are_merged_as_without(tmp_path: Path) -> None:
         merge_maps(here, there, there_to_here)
         merged.append(here)
     assert_same(*merged)
+
+
+def test_a_map_read_into_the_file_is_that_in_memory(tmp_path: Path) -> None:
+    """A flight over the same ground is located in it, bound to it and adjusted, as without."""
+    part = SitePart("morning", 0, CAMERA, 1)
+    georeference = SiteGeoreference(None, 1.0, 0.02, 0.01, "gps")
+    site = site_map_of(flown_round(None), TO_WORLD, (part,), {}, georeference, 1)
+    path = tmp_path / "site.map"
+    write_site_map(path, site)
+    file = ArrayFile(tmp_path)
+    maps = []
+    for far in (None, file):
+        there = slam_map_of(read_site_map(path, far).site, CAMERA)
+        in_file = [not k.features.descriptors.flags.writeable for k in there.keyframes.values()]
+        assert in_file == [far is not None] * len(in_file)
+        here = mapped(
+            Ground(np.random.default_rng(6)), [flown((x, 0.5)) for x in range(6)],
+            Similarity.identity(), first_id=1000,
+        )  # fmt: skip
+        index = KeyframeDatabase()
+        for key, keyframe in there.keyframes.items():
+            index.add(key, keyframe.features.descriptors)
+        newest = here.keyframes[1005]
+        finder = LoopDetector(index, Relocalizer(CAMERA))
+        file.forget()
+        found = finder.find(newest, here, [there], lambda found, same: True)
+        assert found is not None
+        merge_maps(here, there, found.here_from_there)
+        mapper = Mapper(CAMERA, here, MapLock())
+        for key in range(1000, 1006):
+            mapper.fusion.fuse_held(here.keyframes[key])
+        mapper.adjust_locally(newest)
+        shared = np.isin(newest.point_ids, np.concatenate([k.point_ids for k in held(here)]))
+        assert shared.sum() > 100
+        maps.append(here)
+    assert file.n_bytes > 1_000_000 and (maps[1].patch_at < NO_PATCH).sum() > 500
+    assert_same(*maps)
+
+
+def held(slam_map: SlamMap) -> list[Keyframe]:
+    return [slam_map.keyframes[key] for key in sorted(slam_map.held)]
 
 
 def test_a_full_disk_leaves_all_in_memory(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def path(tmp_path: Path) -> Path:
 
 def said(path: Path, is_live: bool) -> list[Warned]:
     """Warnings with the first frame."""
-    stage = work(Setup(Config(map=MapConfig(use=str(path))), CAMERA, is_live=is_live))
+    stage = work(Setup(Config(map=MapConfig(use=str(path))), CAMERA, path.parent, is_live=is_live))
     grey = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
     frame = Frame(0, 1_000_000_000, grey, np.repeat(grey[..., None], 3, 2))
     out = [each for each in stage.step(frame) if isinstance(each, Warned)]

@@ -71,7 +71,7 @@ def test_a_flight_without_origin_has_that_of_the_map(slam_map: SlamMap, site: Si
     slam_map.held = frozenset()
     merged = replace(use.georeference, has_origin=False)  # as in the air, without an origin
     here = use.slam_map
-    again = site_of_flight([(here, merged)], CAMERA, "evening", None, site)
+    again = site_of_flight([(here, merged)], CAMERA, "evening", None, site.account)
     assert again is not None and again.georeference.origin == ORIGIN
     assert again.revision == 2 and [p.flight for p in again.parts] == ["morning"]
     assert [k.t_ns for k in again.keyframes] == [k.t_ns for k in site.keyframes]
