@@ -48,6 +48,6 @@ def test_flights_that_only_a_third_one_joins_and_one_over_another_site(tmp_path:
     assert not (tmp_path / ".merging").exists()
     assert len(read_site_map(tmp_path / SITE_MAP).site.keyframes) == 27
     for each in maps[0].flights:
-        assert each.n_shared > 50 and 0 < each.apart_m < 0.1
+        assert each.n_shared > 50 and each.apart_m is not None and 0 < each.apart_m < 0.1
     page = batch_page([], {}, maps).decode()
     assert "site-2.map" in page and "No place in it is seen in the other maps" in page

@@ -148,7 +148,7 @@ def test_a_map_read_into_the_file_is_that_in_memory(tmp_path: Path) -> None:
         in_file = [not k.features.descriptors.flags.writeable for k in there.keyframes.values()]
         assert in_file == [far is not None] * len(in_file)
         here = mapped(
-            Ground(np.random.default_rng(6)), [flown((x, 0.5)) for x in range(6)],
+            Ground(np.random.default_rng(6)), [flown(np.array([x, 0.5])) for x in range(6)],
             Similarity.identity(), first_id=1000,
         )  # fmt: skip
         index = KeyframeDatabase()

@@ -64,7 +64,7 @@ def test_where_nothing_changed_nothing_is_told() -> None:
     found = compared(ground(), ground())
     assert found.changes == () and found.n_shared > 500
     assert found.n_looked[0] > 0.5 * found.n_points[0]
-    assert 0.0 < found.apart_m < 0.1
+    assert found.apart_m is not None and 0.0 < found.apart_m < 0.1
 
 
 def test_gone_new_and_moved_things_are_told_apart() -> None:
