@@ -66,6 +66,20 @@ def _in_cells(pixels: Floats, n_columns: int, n_rows: int) -> tuple[Ints, Ints]:
     return order, starts
 
 
+@part
+def _keep_nearest(near: Ints, apart: Array, n: int) -> None:
+    """Leave the nearest of `n` features in front, nearest first; where equal, the first ones."""
+    for i in range(1, n):
+        one, d2 = near[i], apart[i]
+        k = min(i, N_NEAREST)
+        while k > 0 and apart[k - 1] > d2:
+            if k < N_NEAREST:
+                near[k], apart[k] = near[k - 1], apart[k - 1]
+            k -= 1
+        if k < N_NEAREST:
+            near[k], apart[k] = one, d2
+
+
 @compiled(integers, integer, integer)
 def find_both(ids: Ints, one: int, other: int) -> tuple[int, int, bool]:
     """First index of an id, -1 if absent, its number, and whether another id is there, too."""
@@ -98,7 +112,11 @@ def search(
         right, bottom = max(right, pixels[i, 0]), max(bottom, pixels[i, 1])
     n_columns, n_rows = int(right / CELL_PX) + 1, int(bottom / CELL_PX) + 1
     order, starts = _in_cells(pixels, n_columns, n_rows)
-    near, apart = np.empty(N_NEAREST, np.int64), np.empty(N_NEAREST)
+    across, down, levels_of = np.empty(n), np.empty(n), np.empty(n, np.int64)
+    for k in range(n):  # of a cell they lie together
+        across[k], down[k] = pixels[order[k], 0], pixels[order[k], 1]
+        levels_of[k] = octaves[order[k]]
+    near, apart = np.empty(n + 1, np.int64), np.empty(n + 1)
     bits = np.empty(N_NEAREST, np.float32)
     taken_by, taken_for = np.full(n, -1, np.int64), np.full(n, _FAR)
     for m in range(len(ids)):
@@ -108,31 +126,30 @@ def search(
             first = row * n_columns + _cell(x - r, n_columns)
             last = row * n_columns + _cell(x + r, n_columns)
             for at in range(starts[first], starts[last + 1]):
-                i = order[at]
-                dx, dy = pixels[i, 0] - x, pixels[i, 1] - y
+                dx, dy = across[at] - x, down[at] - y
                 d2 = dx * dx + dy * dy
-                if d2 > r * r or (n_near == N_NEAREST and d2 >= apart[N_NEAREST - 1]):
-                    continue
-                k = min(n_near, N_NEAREST - 1)
-                while k > 0 and apart[k - 1] > d2:
-                    near[k], apart[k] = near[k - 1], apart[k - 1]
-                    k -= 1
-                near[k], apart[k] = i, d2
-                n_near = min(n_near + 1, N_NEAREST)
+                near[n_near], apart[n_near] = at, d2
+                n_near += not d2 > r * r
+        if n_near > N_NEAREST:
+            _keep_nearest(near, apart, n_near)
+            n_near = N_NEAREST
         best = -1
         for k in range(n_near):
-            i = near[k]
             bits[k] = _FAR
-            if abs(octaves[i] - levels[m]) <= max_octave_gap:
-                bits[k] = _differing_bits(point_words[ids[m]], feature_words[i])
-            if bits[k] <= max_distance and (best < 0 or bits[k] < bits[best]):
+            if abs(levels_of[near[k]] - levels[m]) <= max_octave_gap:
+                bits[k] = _differing_bits(point_words[ids[m]], feature_words[order[near[k]]])
+            if bits[k] <= max_distance and (
+                best < 0
+                or bits[k] < bits[best]
+                or (bits[k] == bits[best] and apart[k] < apart[best])
+            ):
                 best = k
         if best < 0:
             continue
         # ratio test within one level only: adjacent levels show the same corner
-        feature, second_best = near[best], _FAR
+        feature, second_best = order[near[best]], _FAR
         for k in range(n_near):
-            if k != best and octaves[near[k]] == octaves[feature]:
+            if k != best and levels_of[near[k]] == levels_of[near[best]]:
                 second_best = min(second_best, bits[k])
         if bits[best] < np.float32(ratio) * second_best and bits[best] < taken_for[feature]:
             taken_by[feature], taken_for[feature] = m, bits[best]
