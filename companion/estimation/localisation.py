@@ -52,14 +52,10 @@ from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.site_map import SiteMap
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping.far_keyframes import ArrayFile
-from companion.slam.mapping.map_adjustment import MAX_VARIABLE
 from companion.slam.tracking.tracker import Prior, Tracker
 from companion.telemetry import Telemetry
 from companion.timing.clock import Timer
 
-FINAL_ITERATIONS, OF_LARGE_MAP = 8, 2
-"""Iterations of the final global adjustment; 4 and 16 give the sample flight within 0.1 mm. With
-four a map of more than MAX_VARIABLE keyframes takes a second for each hundred."""
 MAX_HEAD_TURN_RAD = np.radians(10.0)
 """Of a gimbal's head from where images have it to where it says it is: at 15 frames/s one that
 begins to turn by 90 degrees a second is 6 degrees off."""
@@ -213,10 +209,7 @@ class LocalisationStage:
         self._take_samples()
         with self._times("final adjustment"):
             for segment in self._segments() if adjust else ():
-                is_large = len(segment.keyframes) > MAX_VARIABLE
-                self._tracker.atlas.mapper_of(segment).adjust_all(
-                    OF_LARGE_MAP if is_large else FINAL_ITERATIONS
-                )
+                self._tracker.atlas.mapper_of(segment).finish()
         out += self._tracker.refined(is_over=True)
         if self._segments():
             out.append(self._georeferences.update(self._segments(), self._t_ns, final=True))

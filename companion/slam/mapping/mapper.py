@@ -17,6 +17,7 @@ from companion.slam.map.patch_refinement import refine_features
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping.culling import cull_keyframes
 from companion.slam.mapping.map_adjustment import (
+    MAX_VARIABLE,
     DisplacementSource,
     apply_result,
     apply_result_later,
@@ -38,6 +39,12 @@ ITERATIONS = 6
 5 mm of it."""
 KEYFRAME_SPACING_DEG = 1.0
 """Keyframes closer than this are culled if redundant: a third of what tracking inserts one for."""
+FINAL_ITERATIONS, FINAL_ROUNDS = 8, 2
+"""Iterations and rounds of the adjustment at a flight's end. An iteration more changes nothing; a
+round more begins without the observations that the last one found wrong, which until then pull at
+a long and thin map: around a building 0.031 m with one round, 0.027 with two and with three."""
+OF_LARGE_MAP = 2
+"""Iterations, in one round, with more than MAX_VARIABLE keyframes: four take a second a hundred."""
 N_IMAGES_KEPT = 100
 """Images of older keyframes are dropped; their features are no longer refined by patches."""
 
@@ -204,6 +211,14 @@ class Mapper:
         shared = [np.count_nonzero(mask[self._map.observations_of(k)[1]]) for k in near]
         order = np.argsort(-np.array(shared), kind="stable")[:N_FIXED]
         return [near[int(i)] for i in order if shared[int(i)] >= 3]
+
+    def finish(self) -> None:
+        """Global bundle adjustment at the end of a flight."""
+        if len(self._map.keyframes) > MAX_VARIABLE:
+            self.adjust_all(OF_LARGE_MAP)
+            return
+        for _ in range(FINAL_ROUNDS):
+            self.adjust_all(FINAL_ITERATIONS)
 
     def adjust_all(self, iterations: int) -> None:
         """Global bundle adjustment, windowed for long flights."""
