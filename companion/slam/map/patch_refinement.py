@@ -8,12 +8,14 @@ from companion.geometry.transforms import Array, Pose
 from companion.messages import Bytes
 from companion.slam.compiled.projecting import warps
 from companion.slam.features.orb_features import Bools, Features, Ints
-from companion.slam.features.patches import align
-from companion.slam.map.sparse_map import SlamMap
+from companion.slam.features.patches import Patches, align, image_levels
+from companion.slam.map.sparse_map import Keyframe, SlamMap
 
 SIGMA_PX = 0.35
 """Expected error of an aligned patch at full resolution; it scales with the pyramid level."""
 MAX_MOVE_SIGMAS = 2.0
+_MAX_APART_PX = np.array([4.0])
+"""Two sigmas of two corners at the level of a patch, each of 1 to 2 px there."""
 
 
 def refine_features(
@@ -41,6 +43,48 @@ def refine_features(
     size = 2.0 ** slam_map.patch_level[points[sure]]
     whitening[sure] = jacobian[sure] / (SIGMA_PX * size)[:, None, None]
     return normalised, whitening, sure
+
+
+def align_points(
+    slam_map: SlamMap, points: Ints, others: Ints, expected_px: Array
+) -> tuple[Array, Bools]:
+    """Alignment of the patches of points (M,) with those of others (M,), without any image.
+
+    Returns where each point is seen beside the other, in pixels (M, 2) of the other's reference
+    view, near where it is expected there, and a mask of success (M,).
+    """
+    apart, sure = expected_px.copy(), np.zeros(len(points), bool)
+    own, theirs = slam_map.patches_of(points), slam_map.patches_of(others)
+    size = 2.0 ** np.maximum(theirs.level, 0)
+    inverse = np.linalg.inv(slam_map.first_unproject[others])
+    jacobian = np.asarray(inverse / size[:, None, None], np.float64)
+    views = slam_map.first_seen[others]
+    for view in np.unique(views[(own.level >= 0) & (theirs.level >= 0)]).tolist():
+        pose = slam_map.pose_of(view)
+        if pose is None:
+            continue
+        here = np.flatnonzero((views == view) & (theirs.level >= 0))
+        warp = _warps(slam_map, pose, points[here], jacobian[here])
+        for k, n in enumerate(here.tolist()):
+            centre = theirs.centre[n : n + 1]
+            start = centre + expected_px[n] / size[n]
+            patch = Patches(own.grey[n : n + 1], own.centre[n : n + 1], own.level[n : n + 1])
+            found, sure[n : n + 1] = align(
+                patch, warp[k : k + 1], image_levels(theirs.grey[n]), start, _MAX_APART_PX
+            )
+            apart[n] = (found - centre)[0] * size[n]
+    return apart, sure
+
+
+def move_features(
+    slam_map: SlamMap, keyframe: Keyframe, features: Ints, points: Ints, apart_px: Array
+) -> None:
+    """Move features (M,) of points (M,) by what is `apart_px` (M, 2) in their reference views."""
+    sigma = keyframe.features.sigma_px[features]
+    jacobian = keyframe.features.whitening[features] * sigma[:, None, None]
+    warp = _warps(slam_map, keyframe.camera_from_map, points, jacobian)
+    moved = np.linalg.solve(jacobian, warp @ apart_px[..., None])[..., 0]
+    keyframe.normalised[features] += moved
 
 
 def _warps(slam_map: SlamMap, camera_from_map: Pose, points: Ints, jacobian: Array) -> Array:

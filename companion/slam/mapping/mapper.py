@@ -13,6 +13,7 @@ from companion.slam.features.matching import match_epipolar
 from companion.slam.features.orb_features import Bools, Ints
 from companion.slam.features.patches import image_levels
 from companion.slam.features.triangulation import consistent, triangulate
+from companion.slam.map.local_map import Projector
 from companion.slam.map.patch_refinement import refine_features
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping.culling import cull_keyframes
@@ -27,6 +28,7 @@ from companion.slam.mapping.map_adjustment import (
     partition,
 )
 from companion.slam.mapping.mapping_worker import MapLock
+from companion.slam.mapping.pass_fusion import fuse_passes
 from companion.slam.mapping.point_fusion import N_NEIGHBOURS, PointFusion
 from companion.slam.optimisation.bundle_adjustment import adjust
 
@@ -56,7 +58,7 @@ class Mapper:
         self, camera: Camera, slam_map: SlamMap, map_lock: MapLock,
         displacements_of: DisplacementSource = no_displacements,
     ) -> None:  # fmt: skip
-        self._displacements_of = displacements_of
+        self._camera, self._displacements_of = camera, displacements_of
         self._map_lock = map_lock
         self._map = slam_map
         self.fusion = PointFusion(camera, slam_map, map_lock)
@@ -213,7 +215,8 @@ class Mapper:
         return [near[int(i)] for i in order if shared[int(i)] >= 3]
 
     def finish(self) -> None:
-        """Global bundle adjustment at the end of a flight."""
+        """Join passes over the same ground at a flight's end, and adjust all once more."""
+        fuse_passes(self._map, Projector(self._camera))
         if len(self._map.keyframes) > MAX_VARIABLE:
             self.adjust_all(OF_LARGE_MAP)
             return
