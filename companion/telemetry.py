@@ -12,7 +12,7 @@ from typing import ClassVar, get_args
 
 from companion.config import MEASUREMENTS, Measurement
 from companion.geometry.transforms import Array
-from companion.telemetry_schema import QUATERNION, VECTOR, Schema, fields_of
+from companion.telemetry_schema import QUATERNION, VECTOR, WHERE_TRUE, Schema, fields_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,7 +29,11 @@ class AttitudeSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSample:
-    """Angular rate and specific force in the body frame, (3,) each."""
+    """Angular rate and specific force in the body frame, (3,) each.
+
+    `less_biases` marks samples from which the autopilot has taken the biases that its EKF
+    estimates: they change, together with its attitude, whenever the EKF learns better.
+    """
 
     schema: ClassVar[Schema] = Schema(
         "imu", "Angular rate and specific force in the body frame (FRD)"
@@ -37,6 +41,7 @@ class ImuSample:
     t_ns: int
     gyro_rad_s: Array = field(metadata=VECTOR)
     accel_m_s2: Array = field(metadata=VECTOR)
+    less_biases: bool = field(default=False, metadata=WHERE_TRUE)
 
 
 class PositionSource(Enum):

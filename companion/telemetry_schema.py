@@ -14,6 +14,9 @@ from typing import Any, get_args, get_type_hints
 
 QUATERNION, VECTOR = {"size": 4}, {"size": 3}
 """Metadata of an array."""
+WHERE_TRUE = {"where_true": True}
+"""Metadata of a flag that came later: it is written only where it is true, so that what was
+written before it is read, and written again, as ever. Such a flag is the last field."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +37,8 @@ class Field:
     may_lack: bool = False
     size: int | None = None
     is_flag: bool = False
+    where_true: bool = False
+    """Of a flag: it is written only where it is true."""
     words: type[Enum] | None = None
 
 
@@ -54,7 +59,7 @@ def _field(message: type[Any], field: dataclasses.Field[Any], kind: Any) -> Fiel
     if kind in (float, float | None):
         return Field(field.name, may_lack)
     if kind is bool:
-        return Field(field.name, is_flag=True)
+        return Field(field.name, is_flag=True, where_true="where_true" in field.metadata)
     if isinstance(kind, type) and issubclass(kind, Enum):
         return Field(field.name, words=kind)
     raise TypeError(f"{message.__name__}.{field.name}: no codec for {kind}")

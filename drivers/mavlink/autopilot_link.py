@@ -36,7 +36,7 @@ from drivers.mavlink.wire.wire import run_together
 from drivers.system.within import within
 from drivers.telemetry.gimbal_messages import GIMBAL_IDS
 from drivers.telemetry.live_samples import LiveSamples
-from drivers.telemetry.mavlink_samples import READERS, landed
+from drivers.telemetry.mavlink_samples import READERS, landed, takes_biases_off
 
 FIRST_SYSTEM = 1
 """System id that we use until the vehicle is heard: on UDP it may send only then."""
@@ -260,6 +260,7 @@ class AutopilotLink:
         if not is_autopilot(message):
             return
         self.vehicle = vehicle_of(message)
+        self.samples.less_biases = takes_biases_off(message)
         if self.vehicle.armed is not self._armed:
             self._armed = self.vehicle.armed
             self._deliver(ArmedSample(receive_ns, self._armed))

@@ -63,7 +63,8 @@ def sample_topic(sample: Telemetry) -> str:
 
 def sample_bytes(sample: Telemetry) -> bytes:
     """A sample without its time."""
-    return json_bytes({f.name: getattr(sample, f.name) for f in FIELDS[type(sample)]})
+    values = ((field, getattr(sample, field.name)) for field in FIELDS[type(sample)])
+    return json_bytes({f.name: value for f, value in values if not f.where_true or value})
 
 
 def decision_bytes(
@@ -225,8 +226,8 @@ def _number(value: Any) -> float:
 
 
 def _value(field: Field, given: Any) -> Any:
-    if given is None and field.may_lack:
-        return None
+    if given is None and (field.may_lack or field.where_true):
+        return False if field.where_true else None
     if field.size is not None:
         if not isinstance(given, list) or len(given) != field.size:
             raise ValueError(f"{field.name} is {given!r}")

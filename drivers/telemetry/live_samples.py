@@ -58,6 +58,8 @@ class LiveSamples:
         self.positions = LivePositions()
         self.gps_searches = False
         """True while the autopilot's GPS sees satellites, and has no fix yet."""
+        self.less_biases = False
+        """True where HIGHRES_IMU is less the biases of the autopilot's EKF (`takes_biases_off`)."""
         self.n_dropped: Counter[str] = Counter()
         """By reason."""
         self._unix_minus_boot_ns: int | None = None
@@ -127,7 +129,7 @@ class LiveSamples:
         if self._wild:
             self._warn_once(WILD, receive_ns, self._wild)
             self._wild = ""
-        for sample in samples_of(message):
+        for sample in samples_of(message, self.less_biases):
             if not is_finite(sample) or not _on_earth(sample):
                 self._drop(UNUSABLE, receive_ns, f"{message.get_type()}: impossible values")
             elif all(choice.takes(kind, receive_ns) for choice in self._choices):

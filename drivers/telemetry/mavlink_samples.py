@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -236,7 +236,24 @@ def searches(message: Any) -> bool:
     return bool(message.fix_type < FIX_3D and 0 < message.satellites_visible < UNKNOWN_8)
 
 
-def samples_of(message: Any) -> list[Telemetry | GeodeticFix]:
-    """Samples of a message that have a valid value; none of a type without a reader."""
-    found = [read(message) for read in READERS.get(message.get_msgId(), ())]
-    return [sample for sample in found if sample is not None]
+def takes_biases_off(heartbeat: Any) -> bool:
+    """True if the autopilot of a HEARTBEAT sends HIGHRES_IMU less the biases of its EKF.
+
+    PX4 does (mavlink/streams/HIGHRES_IMU.hpp), and its SCALED_IMU is as measured; ArduPilot's are.
+    """
+    return bool(heartbeat.autopilot == mavlink.MAV_AUTOPILOT_PX4)
+
+
+def samples_of(message: Any, less_biases: bool) -> list[Telemetry | GeodeticFix]:
+    """Samples of a message that have a valid value; none of a type without a reader.
+
+    With `less_biases` HIGHRES_IMU is less the biases of the autopilot's EKF (`takes_biases_off`).
+    """
+    kind = message.get_msgId()
+    found = [read(message) for read in READERS.get(kind, ())]
+    marked = less_biases and kind == mavlink.MAVLINK_MSG_ID_HIGHRES_IMU
+    return [
+        replace(sample, less_biases=True) if marked and isinstance(sample, ImuSample) else sample
+        for sample in found
+        if sample is not None
+    ]

@@ -3,7 +3,7 @@
 A line is `unix_ns,kind,values`; what a sample does not have is empty. Comments before hold the
 origin, how the clocks were put together, and warnings about the source of the samples. The kind is
 the name of the sample's schema, of a position its source; the values are its fields in order
-(companion/telemetry.py), arrays spread out, flags as 0 or 1.
+(companion/telemetry.py), arrays spread out, flags as 0 or 1, some only where they are true.
 """
 
 from __future__ import annotations
@@ -33,10 +33,14 @@ KINDS: dict[str, type[Telemetry]] = {
     **{source.value: PositionSample for source in PositionSource},
 }
 WIDTHS: dict[str, int] = {
-    name: sum(field.size or 1 for field in FIELDS[kind] if field.words is None)
+    name: sum(f.size or 1 for f in FIELDS[kind] if f.words is None and not f.where_true)
     for name, kind in KINDS.items()
 }
-"""Number of values of each kind."""
+"""Number of values of each kind, without a flag that is written only where it is true."""
+MOST: dict[str, int] = {
+    name: WIDTHS[name] + sum(f.where_true for f in FIELDS[kind]) for name, kind in KINDS.items()
+}
+"""The same with it."""
 
 
 def telemetry_csv(log: TelemetryLog, warnings: Sequence[Warned] = ()) -> Iterator[str]:
@@ -89,12 +93,14 @@ def _values(sample: Telemetry) -> Iterator[float | None]:
         value = getattr(sample, field.name)
         if field.size is not None:
             yield from [None] * field.size if value is None else value
-        elif field.words is None:
+        elif field.words is None and (value or not field.where_true):
             yield value
 
 
 def _sample(words: list[str]) -> Telemetry | None:
-    if len(words) < 3 or len(words) - 2 != WIDTHS.get(words[1]):
+    if len(words) < 3 or words[1] not in KINDS:
+        return None
+    if not WIDTHS[words[1]] <= len(words) - 2 <= MOST[words[1]]:
         return None
     try:
         t_ns = int(words[0])
@@ -112,6 +118,8 @@ def _value(field: Field, kind: str, rest: Iterator[float | None]) -> Any:
     if field.words is not None:
         return field.words(kind)
     numbers = list(islice(rest, field.size or 1))
+    if field.where_true:
+        return numbers == [1.0]
     if numbers[0] is None and field.may_lack:
         return None
     if field.size is not None:

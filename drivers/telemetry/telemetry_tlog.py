@@ -28,6 +28,7 @@ from drivers.telemetry.mavlink_samples import (
     boot_ns,
     landed,
     samples_of,
+    takes_biases_off,
 )
 from drivers.telemetry.telemetry_log import LogContent, TelemetryCollector, is_finite
 from drivers.telemetry.tlog_records import LEAST_US, MOST_US, Record, TlogRecords
@@ -91,6 +92,7 @@ class _Reader:
         self._segments = BootSegments()
         self._armed: bool | None = None
         self._unix_minus_boot_ns: int | None = None
+        self._less_biases = False
 
     def read(self, records: list[Record], warnings: list[Warned]) -> LogContent:
         mine = [
@@ -101,6 +103,10 @@ class _Reader:
         ]
         counts = Counter(record.message_id for record in mine)
         chosen = _chosen(counts)
+        beats = [r for r in mine if r.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT]
+        self._less_biases = any(
+            takes_biases_off(beat) for beat in map(self._packets.decode, beats) if beat is not None
+        )
         for record in mine:
             if record.message_id in chosen:
                 self._take(record)
@@ -142,7 +148,7 @@ class _Reader:
             return
         if kind == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME and message.time_unix_usec:
             self._unix_minus_boot_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
-        samples = samples_of(message)
+        samples = samples_of(message, self._less_biases)
         remote_ns = boot_ns(message, self._unix_minus_boot_ns)
         if remote_ns is None:
             if samples:

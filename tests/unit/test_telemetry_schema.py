@@ -48,6 +48,11 @@ WRITTEN: list[tuple[Telemetry, str, str]] = [
         "5,imu,1.0,2.0,3.0,4.0,5.0,-6.0",
     ),
     (
+        ImuSample(5, np.array([1.0, 2, 3]), np.array([4.0, 5, -6]), less_biases=True),
+        '{"gyro_rad_s":[1.0,2.0,3.0],"accel_m_s2":[4.0,5.0,-6.0],"less_biases":true}',
+        "5,imu,1.0,2.0,3.0,4.0,5.0,-6.0,1.0",
+    ),
+    (
         PositionSample(5, GPS, np.array([1.0, 2, 3]), np.array([4.0, 5, NAN]), 0.5),
         '{"source":"GPS","position_ned_m":[1.0,2.0,3.0],"velocity_ned_m_s":[4.0,5.0,null],'
         '"sigma_horizontal_m":0.5,"sigma_vertical_m":null}',
@@ -76,7 +81,7 @@ SCHEMAS = {
     f'{{"ned_from_body": {NUMBERS}, "rates_body_rad_s": {NUMBERS}}}}}',
     "imu": '{"title": "companion.ImuSample", "description": "Angular rate and specific force in '
     'the body frame (FRD)", "type": "object", "properties": '
-    f'{{"gyro_rad_s": {NUMBERS}, "accel_m_s2": {NUMBERS}}}}}',
+    f'{{"gyro_rad_s": {NUMBERS}, "accel_m_s2": {NUMBERS}, "less_biases": {{"type": "boolean"}}}}}}',
     "position": '{"title": "companion.PositionSample", "description": "Position and velocity of '
     'the body in local NED", "type": "object", "properties": {"source": {"type": "string"}, '
     f'"position_ned_m": {NUMBERS}, "velocity_ned_m_s": {NUMBERS}, '
@@ -137,6 +142,7 @@ def test_the_schemas_in_a_recording_are_as_ever() -> None:
         ("/telemetry/attitude", {"ned_from_body": [1, 0, 0]}),
         ("/telemetry/attitude", {"ned_from_body": None}),
         ("/telemetry/imu", {"gyro_rad_s": [1, 2, True], "accel_m_s2": [1, 2, 3]}),
+        ("/telemetry/imu", {"gyro_rad_s": [1, 2, 3], "accel_m_s2": [1, 2, 3], "less_biases": 1}),
         ("/telemetry/position", {"source": "somewhere", "position_ned_m": [1, 2, 3]}),
         ("/telemetry/armed", {"armed": 1}),
         ("/telemetry/range", {"distance_m": "7.5"}),
@@ -148,7 +154,10 @@ def test_what_does_not_fit_the_schema_is_no_sample(topic: str, given: object) ->
         sample_of(topic, 5, json.dumps(given).encode())
 
 
-@pytest.mark.parametrize("line", ["5,position,1,2,3,,,,,", "5,range", "5,range,1,2", "5,depth,1"])
+@pytest.mark.parametrize(
+    "line",
+    ["5,position,1,2,3,,,,,", "5,range", "5,range,1,2", "5,depth,1", "5,imu,1,2,3,4,5,6,7,8"],
+)
 def test_what_is_no_line_of_the_table_is_left_out(line: str, tmp_path: Path) -> None:
     (tmp_path / "telemetry.csv").write_text(f"unix_ns,kind,values\n{line}\n")
     assert len(read_telemetry_csv(tmp_path / "telemetry.csv").collected) == 0

@@ -1,7 +1,8 @@
 """Integrals of the measured acceleration in NED, by accelerometers and a given attitude.
 
 It is the autopilot's, or its heading alone, with a level by gyroscopes whose bias is known
-(`SteadyLevel`); not where a gimbal's head is what the integrals are of.
+(`SteadyLevel`); not where a gimbal's head is what the integrals are of, nor where the samples are
+less the autopilot's own biases.
 
 Between two times they give the change of velocity and the displacement that an unbiased
 accelerometer measured, and how a bias in body axes changes both: preintegration (Forster et al.,
@@ -189,7 +190,8 @@ class AccelerationIntegral:
             if self._own_level:
                 if self._last is None or sample.t_ns - self._last[0] > MAX_GAP_NS:
                     self.level.reset()
-                rotation = self.level.of(sample.t_ns, sample.gyro_rad_s, rotation)
+                rates = sample.gyro_rad_s
+                rotation = self.level.of(sample.t_ns, rates, rotation, sample.less_biases)
             elif self._lever_body_m is not None:
                 self._lever[0] = rotation @ np.cross(sample.gyro_rad_s, self._lever_body_m)
                 self._lever[1] = rotation @ self._lever_body_m

@@ -3,6 +3,10 @@
 An autopilot finds a change of the bias by where its own place goes astray, which takes it minutes:
 meanwhile its level drifts, and any place that accelerometers give with it. The bias shows sooner in
 the rotations of the images.
+
+Samples from which the autopilot has taken the biases of its own EKF fit its own level alone: where
+it learns better, both change together, by as much as a tenth of a m/s2 and by as much of gravity.
+There the level is the autopilot's.
 """
 
 from __future__ import annotations
@@ -64,6 +68,7 @@ class SteadyLevel:
         """Time and rates of the last sample."""
         self._rotation = np.eye(3)
         self._apart_rad = 0.0
+        self._is_autopilots = False
         self._bias = np.zeros(3)
         self._covariance = np.diag(np.r_[np.zeros(3), np.full(3, SIGMA_BIAS_RAD_S**2)])
         """Of the rotation that is expected of the next image, and of the bias."""
@@ -101,7 +106,8 @@ class SteadyLevel:
     @property
     def walk_m_s2(self) -> float:
         """Walk of the horizontal acceleration by an error of the level, per root of a second."""
-        share = self.lead_hz**2 / (LED_HZ**2 + self.lead_hz**2)
+        led = self.lead_hz**2
+        share = 1.0 if self._is_autopilots else led / (LED_HZ**2 + led)
         by_noise = STANDARD_GRAVITY_M_S2 * float(np.sqrt(self._noise))
         return float(np.linalg.norm([WALK_M_S2, by_noise, share * AUTOPILOT_WALK_M_S2]))
 
@@ -124,9 +130,13 @@ class SteadyLevel:
         """Begin anew with the next sample, from the autopilot's attitude."""
         self._last = None
 
-    def of(self, t_ns: int, rates: Array, autopilot: Array) -> Array:
-        """`ned_from_body` (3, 3) of a sample, in order of time; `autopilot` is its own there."""
+    def of(self, t_ns: int, rates: Array, autopilot: Array, less_biases: bool = False) -> Array:
+        """`ned_from_body` (3, 3) of a sample, in order of time; `autopilot` is its own there.
+
+        With `less_biases` the sample is less what the autopilot's EKF takes for biases.
+        """
         last, self._last = self._last, (t_ns, rates)
+        self._is_autopilots = less_biases
         if last is None:
             self._rotation, self._apart_rad = autopilot, 0.0
             return autopilot
@@ -140,7 +150,8 @@ class SteadyLevel:
         ))) @ rotation  # fmt: skip
         off = vector_from_rotation(autopilot @ rotation.T)
         self._apart_rad = float(np.hypot(off[0], off[1]))
-        self._rotation = rotation_from_vector(min(self.lead_hz * dt_s, 1.0) * off) @ rotation
+        gain = 1.0 if less_biases else min(self.lead_hz * dt_s, 1.0)
+        self._rotation = rotation_from_vector(gain * off) @ rotation
         if t_ns - self._images_ns > IMAGES_LAST_S * 1e9 and t_ns - self._seen_ns > 1e8:
             self._learn(t_ns, autopilot, BY_AUTOPILOT, SIGMA_AUTOPILOT_RAD, AUTOPILOT_S)
         return self._rotation

@@ -24,6 +24,7 @@ from companion.telemetry import (
     ArmedSample,
     AttitudeSample,
     HeightSample,
+    ImuSample,
     PositionSample,
     PositionSource,
     Telemetry,
@@ -196,6 +197,8 @@ async def test_finds_the_autopilot_and_stamps_what_it_measures(firmware: str) ->
             assert 25 < link.rates_hz["ATTITUDE_QUATERNION"] < 60
             assert 50 < link.rates_hz["HIGHRES_IMU"] < 120
             assert link.health.state == "running" and link.health.n_dropped < 20
+            marks = {s.less_biases for s in heard.samples if isinstance(s, ImuSample)}
+            assert marks == {firmware == "px4"}
             # every message is asked for once, and the right ones are
             assert max(Counter(intervals(autopilot)).values()) == 1
             assert {31, 105, 32, 33, 24, 29, 132, 2, 245} == set(intervals(autopilot))

@@ -262,6 +262,26 @@ def test_an_imu_message_that_holds_no_imu(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("autopilot", "marked"),
+    [(mavlink.MAV_AUTOPILOT_PX4, True), (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, False)],
+)
+def test_the_imu_that_px4_takes_its_biases_off_is_marked(
+    tmp_path: Path, autopilot: int, marked: bool
+) -> None:
+    """From the first sample on, though the first HEARTBEAT comes later; SCALED_IMU never is."""
+    log, zeros = Tlog(), [0] * 9
+    log.add(START_NS, mavlink.MAVLink_highres_imu_message(83_000_000, *zeros, 900, 0, 0, 20, 0x3F))
+    log.add(START_NS, heartbeat(False, autopilot))
+    (imu,) = of(read(tmp_path, log), ImuSample)
+    assert imu.less_biases is marked
+    log = Tlog()
+    log.add(START_NS, heartbeat(False, autopilot))
+    log.add(START_NS, mavlink.MAVLink_scaled_imu_message(83_000, *zeros, 0))
+    (imu,) = of(read(tmp_path, log), ImuSample)
+    assert not imu.less_biases
+
+
+@pytest.mark.parametrize(
     ("orientation", "distance"), [(0, 1000), (25, 0), (25, 10), (25, 4000), (25, 65535)]
 )
 def test_ranges_that_say_nothing(tmp_path: Path, orientation: int, distance: int) -> None:
