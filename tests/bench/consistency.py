@@ -21,9 +21,10 @@ from __future__ import annotations
 import argparse
 import json
 from collections import defaultdict
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -31,8 +32,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from companion.app.replay.poses_sent import PosesSent
 from companion.config_file import load_config
+from companion.estimation.body import body_filter
 from companion.estimation.body.aiding import Model
 from companion.estimation.body.body_state import BodyState
+from companion.estimation.body.gated_correction import corrected_by
 from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.estimation.localisation import LocalisationStage
 from companion.geometry.transforms import Array
@@ -82,16 +85,15 @@ class Truth:
         return Motion(self._place(t_s), self._place(t_s, 1), self._turn(t_s))
 
 
-def watch_innovations(stage: LocalisationStage, found: Squares) -> None:
-    """Keep squared innovations of a stage's filter of the body as they come."""
-    corrected = stage._smooth._course.body._corrected
+def innovations_watched(found: Squares) -> AbstractContextManager[object]:
+    """Keep squared innovations of filters of the body as they come, meanwhile."""
 
     def watched(state: BodyState, model: Model) -> tuple[BodyState | None, float]:
-        after, squared = corrected(state, model)
+        after, squared = corrected_by(state, model)
         found[f"NIS {model.kind.value}"].append(squared)
         return after, squared
 
-    stage._smooth._course.body._corrected = watched  # type: ignore[method-assign]
+    return patch.object(body_filter, "corrected_by", watched)
 
 
 def fly(path: Path, denied: bool, seed: int, settings: list[str]) -> Squares:
@@ -100,13 +102,13 @@ def fly(path: Path, denied: bool, seed: int, settings: list[str]) -> Squares:
     flight = open_flight(path, config.camera, config.telemetry)
     stage = LocalisationStage(config, flight.camera, lambda _: nullcontext())
     found, sent = defaultdict[str, list[float]](list), PosesSent(config)
-    watch_innovations(stage, found)
     samples = [s for s in flight.telemetry().samples if s.t_ns > flight.start_ns - WINDOW_NS]
-    for message in in_order_of_time(list(with_noise(samples, seed)), flight.frames()):
-        sent.take(message)
-        for out in stage.step(message):
-            if isinstance(out, Odometry):
-                sent.take(out)
+    with innovations_watched(found):
+        for message in in_order_of_time(list(with_noise(samples, seed)), flight.frames()):
+            sent.take(message)
+            for out in stage.step(message):
+                if isinstance(out, Odometry):
+                    sent.take(out)
     truth = Truth(path)
     for number in sorted({p.reset_counter for p in sent.poses}):
         of_one = [p for p in sent.poses if p.reset_counter == number]

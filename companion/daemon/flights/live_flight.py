@@ -89,13 +89,9 @@ class LiveFlight:
     """Processes of one flight: on standby before `begin`, then flying."""
 
     def __init__(
-        self,
-        config: Config,
-        camera: Camera,
-        clock: FlightClock,
-        listener: Callable[[LiveFlight], Listener],
-        start: Start,
-    ) -> None:
+        self, config: Config, camera: Camera, clock: FlightClock,
+        listener: Callable[[LiveFlight], Listener], start: Start,
+    ) -> None:  # fmt: skip
         self._config, self.camera, self._clock = config, camera, clock
         self._began_s = monotonic_s()
         self._listener = listener(self)

@@ -22,7 +22,6 @@ from companion.estimation.body.aiding import (
     AidedPlace,
     AidedRest,
     Aiding,
-    Model,
     model_of,
 )
 from companion.estimation.body.body_state import (
@@ -31,7 +30,6 @@ from companion.estimation.body.body_state import (
     DRIFT,
     GROUND,
     N_STATE,
-    SCALE,
     SIGMA_DRIFT_M_S3,
     BodyState,
     Reckoned,
@@ -39,6 +37,7 @@ from companion.estimation.body.body_state import (
     held,
     propagated,
 )
+from companion.estimation.body.gated_correction import CHI_SQUARE_LIMIT, corrected_by
 from companion.estimation.body.refused_run import RefusedRun
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_motion import (
@@ -59,8 +58,6 @@ MAX_HELD_NS = 400_000_000
 and so late a measurement may come."""
 LEAST_MOVE = 1e-12
 """Of a frame, metres and radians: less is rounding."""
-CHI_SQUARE_LIMIT = {1: 10.83, 2: 13.82, 3: 16.27}
-"""Chi-square that is exceeded once in a thousand times, by degrees of freedom."""
 NORMALISED_TAU = 30
 """Places, two seconds of them."""
 TELL_LEVEL = Aid.PLACE, Aid.FLOW, Aid.REST
@@ -277,7 +274,7 @@ class BodyFilter:
         if model is None:
             return
         self._taken.append((before, measured))
-        corrected, squared = self._corrected(state, model)
+        corrected, squared = corrected_by(state, model)
         if corrected is not None:
             self._state = corrected
             self._aided_ns = measured.t_ns if model.kind in TELL_LEVEL else self._aided_ns
@@ -292,22 +289,6 @@ class BodyFilter:
             self._judge(measured, refused=corrected is None)
         if isinstance(measured, AidedRest):
             self._judge_rest(state, measured, refused=corrected is None)
-
-    def _corrected(self, state: BodyState, model: Model) -> tuple[BodyState | None, float]:
-        """The state corrected, None where the innovation gate refuses; the squared innovation."""
-        seen, spread = model.seen, state.covariance
-        innovation = model.measured - seen @ state.mean
-        gained = seen @ spread
-        expected = gained @ seen.T + model.covariance
-        squared = float(innovation @ np.linalg.solve(expected, innovation))
-        if squared > CHI_SQUARE_LIMIT[len(seen)]:
-            return None, squared
-        gain = np.linalg.solve(expected, gained).T
-        gain[[*model.considered, SCALE]] = 0.0
-        part = gain @ gained
-        spread = spread - part - part.T + gain @ expected @ gain.T
-        covariance = 0.5 * (spread + spread.T)
-        return state._replace(mean=state.mean + gain @ innovation, covariance=covariance), squared
 
     def _judge(self, place: AidedPlace, refused: bool) -> None:
         """Begin anew with a place, where places have been refused for too long."""

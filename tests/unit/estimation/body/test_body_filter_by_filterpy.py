@@ -7,8 +7,9 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 from companion.estimation.body.aiding import AidedPlace, AidedRest
-from companion.estimation.body.body_filter import CHI_SQUARE_LIMIT, NORMALISED_TAU, BodyFilter
+from companion.estimation.body.body_filter import NORMALISED_TAU, BodyFilter
 from companion.estimation.body.body_state import UNMEASURED_M_S2
+from companion.estimation.body.gated_correction import CHI_SQUARE_LIMIT
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_motion import SIGMA_SPEED_M_S
 from companion.geometry.transforms import Array
