@@ -8,6 +8,7 @@ import numpy as np
 
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Array, Pose
+from companion.slam.compiled.observing import distinct
 from companion.slam.compiled.projecting import (
     EQUIDISTANT,
     N_COEFFICIENTS,
@@ -92,11 +93,7 @@ def local_points(slam_map: SlamMap, near_ids: Ints, centre: Array, n_keyframes: 
     """
     chosen = [k for _, k in slam_map.covisible(near_ids, 8)[:n_keyframes]]
     chosen += slam_map.nearest(centre, N_NEAREST, set(chosen))
-    seen = [slam_map.observations_of(slam_map.keyframes[each])[1] for each in chosen]
-    ids = np.concatenate(seen) if seen else np.zeros(0, np.int64)
-    if not len(ids):
-        return ids
-    lowest = int(ids.min())  # on new ground their numbers lie together, in a map of any size
-    mask = np.zeros(int(ids.max()) - lowest + 1, bool)
-    mask[ids - lowest] = True
-    return np.flatnonzero(mask) + lowest
+    if not chosen:
+        return np.zeros(0, np.int64)
+    seen = np.concatenate([slam_map.keyframes[each].point_ids for each in chosen])
+    return distinct(seen, slam_map.alive)

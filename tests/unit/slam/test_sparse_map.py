@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from companion.geometry.transforms import Array, Pose, Similarity, angle_between
+from companion.slam.compiled.observing import distinct
 from companion.slam.features.patches import image_levels
 from companion.slam.map.sparse_map import SlamMap
 from companion.slam.mapping.mapper import Mapper
@@ -169,3 +170,16 @@ def test_dead_points_are_not_observed(slam_map: SlamMap) -> None:
     assert 0 < len(features) < np.count_nonzero(ids >= 0)
     np.testing.assert_array_equal(found, features)
     np.testing.assert_array_equal(points, ids[features])
+
+
+def test_local_points_are_each_of_the_living_ones_that_keyframes_observe(
+    slam_map: SlamMap,
+) -> None:
+    near = list(slam_map.keyframes.values())
+    near[1].point_ids[::3] = -1
+    slam_map.alive[near[2].point_ids[1::6]] = False
+    ids = np.concatenate([each.point_ids for each in near])
+    expected = np.unique(ids[(ids >= 0) & slam_map.alive[np.maximum(ids, 0)]])
+    assert 0 < len(expected) < len(ids)
+    np.testing.assert_array_equal(distinct(ids, slam_map.alive), expected)
+    assert len(distinct(np.full(4, -1), slam_map.alive)) == 0
