@@ -13,7 +13,7 @@ from tests.support.flights.recorded import record
 from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
 
 pytest.importorskip("distributed")
-FIRST, SECOND = "2026-01-01T00-00-00Z", "2026-01-02T00-00-00Z"
+FIRST, SECOND, THIRD = (f"2026-01-0{day}T00-00-00Z" for day in (1, 2, 3))
 
 
 IMPATIENT = """
@@ -30,12 +30,13 @@ def batch(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
 
 
-def test_an_archive_is_replayed_once_and_shown_on_one_page(tmp_path: Path) -> None:
+def test_an_archive_is_replayed_once_merged_and_shown_on_one_page(tmp_path: Path) -> None:
     record(tmp_path / FIRST, 12)
     record(tmp_path / SECOND, 12, "raw")
+    record(tmp_path / THIRD, 12)
     (tmp_path / "empty").mkdir()
     record(tmp_path / "short", 2)
-    flights = [tmp_path / FIRST, tmp_path / SECOND / "flight.mcap"]
+    flights = [tmp_path / FIRST, tmp_path / SECOND / "flight.mcap", tmp_path / THIRD]
     flights += [tmp_path / "empty", tmp_path / "short"]
     out = tmp_path / "out"
     settings = "--out", out, "--set", "depth.enabled=false"
@@ -44,25 +45,21 @@ def test_an_archive_is_replayed_once_and_shown_on_one_page(tmp_path: Path) -> No
     lines = done.stderr.splitlines()
     assert len(lines) == 2 and lines[0].startswith("companion: empty: "), done.stderr
     assert lines[1].startswith("companion: short: no map: "), done.stderr
-    assert "4 flights, 0 done before, 2 failed" in done.stdout
-    for name in (FIRST, SECOND):
+    assert "5 flights, 0 done before, 2 failed" in done.stdout
+    for name in (FIRST, SECOND, THIRD):
         assert json.loads((out / name / "report.json").read_text())["frames"] == 12
     page = (out / "index.html").read_text()
-    assert page.count("data:image/jpeg;base64,") == 2
+    assert page.count("data:image/jpeg;base64,") == 3
     assert f'href="{FIRST}/report.html"' in page and "no video and no images" in page
     assert 'href="short/report.html"' in page and (out / "short" / "report.html").is_file()
     assert 'href="empty/' not in page
 
-    stamps = [(out / name / "report.json").stat().st_mtime_ns for name in (FIRST, SECOND)]
-    record(tmp_path / "other" / SECOND, 10)
-    (tmp_path / "other" / SECOND / "flight.mcap").replace(tmp_path / SECOND / "flight.mcap")
-    done = batch(*flights[:2], *settings)
-    assert done.returncode == 0, done.stderr
-    assert "2 flights, 1 done before, 0 failed" in done.stdout
-    again = [(out / name / "report.json").stat().st_mtime_ns for name in (FIRST, SECOND)]
-    assert again[0] == stamps[0] and again[1] > stamps[1]
-    assert json.loads((out / SECOND / "report.json").read_text())["frames"] == 10
+    def stamps() -> list[int]:
+        return [(out / name / "report.json").stat().st_mtime_ns for name in (FIRST, SECOND, THIRD)]
 
+    before = stamps()
+    record(tmp_path / "other" / THIRD, 10)
+    (tmp_path / "other" / THIRD / "flight.mcap").replace(tmp_path / THIRD / "flight.mcap")
     ground = Ground(np.random.default_rng(5))
     for n, name in enumerate((FIRST, SECOND)):
         path = [flown(p, 2.6 * n) for p in np.linspace((-5, n), (5, -n), 9)]
@@ -70,9 +67,13 @@ def test_an_archive_is_replayed_once_and_shown_on_one_page(tmp_path: Path) -> No
         part, placed = SitePart(name, 0, CAMERA, 1), SiteGeoreference(None, 1.0, 0.02, 0.01, "gps")
         site = site_map_of(made, Similarity.identity(), (part,), {}, placed, 1)
         write_site_map(out / name / SITE_MAP, site)
-    done = batch(*flights[:2], *settings, "--merge")
+    done = batch(*flights[:3], *settings, "--merge")
     assert done.returncode == 0, done.stderr
-    assert "2 done before" in done.stdout and f"site.map: {FIRST}, {SECOND}" in done.stdout
+    assert "3 flights, 2 done before, 0 failed" in done.stdout
+    again = stamps()
+    assert again[:2] == before[:2] and again[2] > before[2]
+    assert json.loads((out / THIRD / "report.json").read_text())["frames"] == 10
+    assert f"site.map: {FIRST}, {SECOND}" in done.stdout
     assert len(read_site_map(out / SITE_MAP).site.keyframes) == 18
     assert "of these also seen by others" in (out / "index.html").read_text()
 
