@@ -36,7 +36,7 @@ def test_what_was_finished_is_written(tmp_path: Path, where: str, n_before: int)
     command = [sys.executable, "-c", FAILS, where, str(n_before), "replay", str(SAMPLE)]
     out = tmp_path / "out"
     done = subprocess.run(
-        [*command, "--out", str(out), "--stop", "6", "--set", "expert.depth.stride=4"],
+        [*command, "--out", str(out), "--stop", "6", "--set", "expert.depth.stride=8"],
         capture_output=True, text=True, timeout=200, check=False,
     )  # fmt: skip
     assert done.returncode == 1, done.stderr

@@ -14,7 +14,7 @@ from tests.support.processes.program import Run, replay, replay_here
 from tests.support.reference.scoring import Score, depth_errors, read_ply, read_tum, score
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
-SHORT = ["--start", "10", "--stop", "14", "--set", "expert.depth.stride=4"]
+SHORT = ["--start", "10", "--stop", "14", "--set", "expert.depth.stride=8"]
 
 
 @pytest.fixture(scope="module")

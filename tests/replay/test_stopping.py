@@ -37,7 +37,7 @@ def test_results_so_far(tmp_path: Path, number: signal.Signals, status: int, den
             "--set",
             f"depth.enabled={dense}",
             "--set",
-            "expert.depth.stride=4",
+            "expert.depth.stride=8",
         ],
         stderr=theirs,
         stdout=subprocess.DEVNULL,
