@@ -8,8 +8,8 @@ FLIGHTS is the folder of the rendered flights; maps and paths are kept in DIR, a
 - located: campus_return in the map of campus_orbit. When it was located, and the error of its
   frames after the similarity that fits campus_orbit's own path to its truth.
 - denied: the same of campus_return with attitude and accelerations alone.
-- merged: the maps of the three flights as one; errors of keyframes against truth after one
-  similarity, of each map alone and of all together.
+- merged: the maps of the three flights as one; errors of keyframes against truth after a
+  similarity for each flight, alone and in the one map, and after one for all.
 - others: every keyframe of every flight is looked for in the map of every other site, with no
   word from the autopilot. Flights over the campus are of one site.
 """
@@ -168,9 +168,11 @@ def merged(flights: Path, work: Path) -> None:
         before, true_before = keyframes_of(site, flights)
         own = both.part_of == n
         alone.append((before, true_before))
+        by_own = similarity(found[own], true[own])
         print(
-            f"  {name}: alone {rms(before, true_before, similarity(before, true_before)):.3f} m, "
-            f"in the one map {rms(found[own], true[own], fit):.3f} m; in its own world alone "
+            f"  {name}: alone {rms(before, true_before, similarity(before, true_before)):.4f} m, "
+            f"in the one map {rms(found[own], true[own], by_own):.4f} m (by the one similarity "
+            f"{rms(found[own], true[own], fit):.3f} m); in its own world alone "
             f"{rms(before, true_before, Similarity.identity()):.3f} m, in the one map "
             f"{rms(found[own], true[own], Similarity.identity()):.3f} m"
         )  # fmt: skip

@@ -14,8 +14,6 @@ from companion.slam.map.sparse_map import Keyframe, SlamMap
 SIGMA_PX = 0.35
 """Expected error of an aligned patch at full resolution; it scales with the pyramid level."""
 MAX_MOVE_SIGMAS = 2.0
-_MAX_APART_PX = np.array([4.0])
-"""Two sigmas of two corners at the level of a patch, each of 1 to 2 px there."""
 
 
 def refine_features(
@@ -46,33 +44,32 @@ def refine_features(
 
 
 def align_points(
-    slam_map: SlamMap, points: Ints, others: Ints, expected_px: Array
+    slam_map: SlamMap, points: Ints, others: Ints, max_apart_px: float
 ) -> tuple[Array, Bools]:
     """Alignment of the patches of points (M,) with those of others (M,), without any image.
 
     Returns where each point is seen beside the other, in pixels (M, 2) of the other's reference
-    view, near where it is expected there, and a mask of success (M,).
+    view, and a mask of success (M,). `max_apart_px` is at the level of the other's patch.
     """
-    apart, sure = expected_px.copy(), np.zeros(len(points), bool)
     own, theirs = slam_map.patches_of(points), slam_map.patches_of(others)
     size = 2.0 ** np.maximum(theirs.level, 0)
     inverse = np.linalg.inv(slam_map.first_unproject[others])
     jacobian = np.asarray(inverse / size[:, None, None], np.float64)
+    warp = np.full((len(points), 2, 2), np.nan)
     views = slam_map.first_seen[others]
-    for view in np.unique(views[(own.level >= 0) & (theirs.level >= 0)]).tolist():
+    for view in np.unique(views).tolist():
         pose = slam_map.pose_of(view)
-        if pose is None:
-            continue
-        here = np.flatnonzero((views == view) & (theirs.level >= 0))
-        warp = _warps(slam_map, pose, points[here], jacobian[here])
-        for k, n in enumerate(here.tolist()):
-            centre = theirs.centre[n : n + 1]
-            start = centre + expected_px[n] / size[n]
-            patch = Patches(own.grey[n : n + 1], own.centre[n : n + 1], own.level[n : n + 1])
-            found, sure[n : n + 1] = align(
-                patch, warp[k : k + 1], image_levels(theirs.grey[n]), start, _MAX_APART_PX
-            )
-            apart[n] = (found - centre)[0] * size[n]
+        if pose is not None:
+            here = np.flatnonzero(views == view)
+            warp[here] = _warps(slam_map, pose, points[here], jacobian[here])
+    apart, sure = np.zeros((len(points), 2)), theirs.level >= 0
+    for n in np.flatnonzero(sure).tolist():
+        one = slice(n, n + 1)
+        found, sure[one] = align(
+            Patches(own.grey[one], own.centre[one], own.level[one]), warp[one],
+            image_levels(theirs.grey[n]), theirs.centre[one], np.array([max_apart_px]),
+        )  # fmt: skip
+        apart[one] = (found - theirs.centre[one]) * size[n]
     return apart, sure
 
 

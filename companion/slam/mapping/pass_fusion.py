@@ -13,6 +13,8 @@ from companion.slam.map.sparse_map import Keyframe, SlamMap
 RADIUS_PX, MAX_BITS = 3.0, 50
 """Largest distance from where a point is predicted, at pyramid level 0, and of descriptors: as of
 the fusion in flight."""
+MAX_APART_PX = 4.0
+"""Two sigmas of two corners at the level of a patch, each of 1 to 2 px there."""
 N_NEAR = 60
 """Keyframes looked at about each one: 2 ms, in a map of any size."""
 
@@ -25,7 +27,7 @@ def fuse_passes(slam_map: SlamMap, projector: Projector) -> int:
     observe nothing yet are left so: a detected corner is not aligned, and the scale of a flight
     around a building was 0.1 % worse by them.
     """
-    pairs = _one_to_one(
+    pairs = one_to_one(
         np.concatenate(
             [np.zeros((0, 2), np.int64)]
             + [
@@ -37,8 +39,8 @@ def fuse_passes(slam_map: SlamMap, projector: Projector) -> int:
     )
     fewer = slam_map.n_observers[pairs[:, 0]] < slam_map.n_observers[pairs[:, 1]]
     pairs[fewer] = pairs[fewer, ::-1]
-    apart_px, sure = align_points(slam_map, pairs[:, 0], pairs[:, 1], np.zeros((len(pairs), 2)))
-    _unite(slam_map, pairs[sure, 0], pairs[sure, 1], apart_px[sure])
+    apart_px, sure = align_points(slam_map, pairs[:, 0], pairs[:, 1], MAX_APART_PX)
+    unite(slam_map, pairs[sure, 0], pairs[sure, 1], apart_px[sure])
     return int(np.count_nonzero(sure))
 
 
@@ -58,8 +60,8 @@ def _candidates(slam_map: SlamMap, projector: Projector, keyframe: Keyframe) -> 
     return np.stack([ids[alive], own[alive]], 1)
 
 
-def _one_to_one(pairs: Ints) -> Ints:
-    """The pairs found most often, in which each point is once."""
+def one_to_one(pairs: Ints) -> Ints:
+    """The pairs found most often, in which each point is once; the lower id first."""
     distinct, often = np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)
     taken: set[int] = set()
     out = []
@@ -70,7 +72,7 @@ def _one_to_one(pairs: Ints) -> Ints:
     return np.array(out, np.int64).reshape(-1, 2)
 
 
-def _unite(slam_map: SlamMap, kept: Ints, dropped: Ints, apart_px: Array) -> None:
+def unite(slam_map: SlamMap, kept: Ints, dropped: Ints, apart_px: Array) -> None:
     """Let points take over all observations of others, moved by what is apart in their views."""
     row = np.full(slam_map.n_points, -1)
     row[dropped] = np.arange(len(dropped))

@@ -22,6 +22,7 @@ from companion.slam.map.site_map import (
 from companion.slam.map.sparse_map import SlamMap
 from companion.slam.mapping.mapper import Mapper
 from companion.slam.mapping.mapping_worker import MapLock
+from companion.slam.mapping.site_fusion import fuse_sites
 
 ENOUGH_FOUND = 8
 """Confirmed keyframes of which the one with most points places a map: more are no better."""
@@ -47,13 +48,9 @@ def merge_sites(first: SiteMap, other: SiteMap, other_in_first: Similarity) -> S
     merge_maps(here, there, found.here_from_there)
     mapper = Mapper(camera, here, MapLock())
     for _ in range(BINDING_ROUNDS):
-        for key, keyframe in here.keyframes.items():
-            if key not in here.held:
-                mapper.fusion.fuse_held(keyframe)
-        _loosen(here, _n_ids(first))
+        fuse_sites(here, camera)
         mapper.adjust_all(ITERATIONS)
     here.held = frozenset()
-    _loosen(here, _n_ids(first))
     mapper.adjust_all(ITERATIONS)
     n_first = len(first.parts)
     part_of_id = dict(zip(_ids(first), first.part_of.tolist(), strict=True)) | {
@@ -67,23 +64,6 @@ def merge_sites(first: SiteMap, other: SiteMap, other_in_first: Similarity) -> S
         here, _placed(here, before), (*first.parts, *newer), part_of_id, georeference,
         revision,
     )  # fmt: skip
-
-
-def _loosen(slam_map: SlamMap, n_first: int) -> None:
-    """Count features of points that both maps observe as detected corners, not as refined ones.
-
-    Each map refined them against a patch of its own, and the corners of two patches are up to a
-    pixel apart: taken as sure as they are among themselves they bend both maps. The keyframes of
-    the first map are those with ids below `n_first`.
-    """
-    seen = np.zeros((2, slam_map.n_points), bool)
-    for key, keyframe in slam_map.keyframes.items():
-        seen[int(key < n_first), slam_map.observations_of(keyframe)[1]] = True
-    in_both = seen[0] & seen[1]
-    for keyframe in slam_map.keyframes.values():
-        features, ids = slam_map.observations_of(keyframe)
-        shared = features[in_both[ids]]
-        keyframe.whitening[shared] = keyframe.features.whitening[shared]
 
 
 def _ids(site: SiteMap) -> list[int]:

@@ -9,13 +9,16 @@ import numpy as np
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, Similarity, yaw_rotation
 from companion.messages import Bytes
+from companion.slam.compiled.patch_alignment import STORED
 from companion.slam.features.orb_features import Features
-from companion.slam.features.patches import image_levels
+from companion.slam.features.patches import Patches, image_levels
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from tests.support.flights.scene import DOWN_LOOKING
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 SCALE_FACTOR, N_LEVELS = 1.2, 8
+N_WAVES = 12
+"""Of the ground's grey, 5 to 20 pixels long as seen from HEIGHT."""
 GREY = np.full((480, 640), 128, np.uint8)
 HEIGHT = 10.0
 
@@ -28,6 +31,28 @@ class Ground:
         height = rng.uniform(-2.0, 0.0, n)
         self.points: Array = np.c_[rng.uniform(-half, half, (n, 2)), height]
         self.descriptors: Bytes = rng.integers(0, 256, (n, 32)).astype(np.uint8)
+        looks = np.random.default_rng(int(self.descriptors[0, :4].view(np.uint32)[0]))
+        wavelength_m, along = looks.uniform(0.1, 0.4, N_WAVES), looks.uniform(0, 2 * np.pi, N_WAVES)
+        self._waves: Array = 2 * np.pi / wavelength_m * np.stack([np.cos(along), np.sin(along)])
+        self._phases: Array = looks.uniform(0, 2 * np.pi, N_WAVES)
+
+    def grey_at(self, places: Array) -> Bytes:
+        """Grey levels (...,) of the ground, or of a level piece of it, at places (..., 2)."""
+        waves = np.sin(places @ self._waves + self._phases).sum(-1)
+        return np.asarray(np.clip(128 + 25 * waves, 0, 255), np.uint8)
+
+    def patches(self, world_from_camera: Pose, seen: Array, index: Array) -> Patches:
+        """Patches about pixels (N, 2), each the picture of a level piece of ground at a point."""
+        corner = np.floor(seen) - STORED // 2 + 1
+        steps = np.stack(np.meshgrid(np.arange(STORED), np.arange(STORED)), -1)
+        pixels = corner[:, None, None] + steps
+        rays = np.concatenate(
+            [CAMERA.normalise(pixels.reshape(-1, 2)), np.ones((pixels[..., 0].size, 1))], 1
+        ) @ world_from_camera.rotation.T  # fmt: skip
+        depth = self.points[index, 2] - world_from_camera.translation[2]
+        rays = rays.reshape(*pixels.shape[:3], 3)
+        places = world_from_camera.translation[:2] + rays[..., :2] * depth[:, None, None, None]
+        return Patches(self.grey_at(places), seen - corner, np.zeros(len(index), np.int64))
 
     def repeat(self, period: float) -> None:
         """Make descriptors periodic in x, as on a facade."""
@@ -92,6 +117,11 @@ def mapped(
             map_from_world.apply(ground.points[index[new]]),
             keyframe.keyframe_id, keyframe.features, new, levels,
         )  # fmt: skip
+        patches = ground.patches(
+            world_from_camera, features.pixels[new].astype(np.float64), index[new]
+        )
+        slam_map.patches.near[slam_map.patch_at[ids]] = patches.grey
+        slam_map.patch_centre[ids], slam_map.patch_level[ids] = patches.centre, patches.level
         known.update(zip(index[new].tolist(), ids.tolist(), strict=True))
         points = np.array([known[i] for i in index.tolist()])
         slam_map.add_observations(keyframe, np.arange(len(features)), points)
