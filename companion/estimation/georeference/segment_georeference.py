@@ -59,6 +59,8 @@ class SegmentGeoreferences:
         """A resumed segment and its stored georeference."""
         self._held: dict[int, Georeference] = {}
         """Of maps that are, or have taken over, that of an earlier flight; nothing moves them."""
+        self.scale_of_held: Scale | None = None
+        """Of the newest segment, where it is held, by accelerometers."""
         self._main: int | None = None
         self._revision = self._solved_ns = 0
         self._acceleration = acceleration
@@ -111,6 +113,12 @@ class SegmentGeoreferences:
             if key in self._known:
                 self._known[key] = self._held[key]
 
+    def release(self) -> None:
+        """Maps of an earlier flight lie where this flight's measurements say, if they say."""
+        for key in self._held:
+            self._known.pop(key, None)
+        self._held.clear()
+
     def _more_certain(self, segment: SlamMap, found: Georeference) -> Georeference:
         """The found or the stored georeference of a segment, whichever is more certain.
 
@@ -144,6 +152,8 @@ class SegmentGeoreferences:
             self._solved_ns = t_ns
         for segment in segments:
             if segment.first_keyframe_id in self._held:
+                if due and not final and segment is segments[-1]:
+                    self.scale_of_held = self._inertial_scale(segment, t_ns, final=False)
                 continue
             if final or (segment is segments[-1] and due):
                 found = self._georeferencer.solve(

@@ -87,6 +87,10 @@ class SiteInFlight:
             if use.compare(place_m, self._georeferencer.path.place_at(at_ns)):
                 self._georeferences.give_up_place()
         placed = self._georeferences.of(self._tracker.map)
+        measured = self._georeferences.scale_of_held
+        if placed is not None and measured is not None and use.compare_scale(placed, measured):
+            self._georeferences.release()
+            return
         if self._place is None and placed is not None and map_from_camera is not None:
             self._place = t_ns, placed.world_from_map.apply(map_from_camera.translation)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from companion.estimation.georeference.trajectory_alignment import Scale
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned, ned_from_geodetic
 from companion.geometry.transforms import Array, Similarity
@@ -42,7 +43,9 @@ class SiteUse:
         """Keyframes and points are in `slam_map`, and grow old in it."""
         self.slam_map: SlamMap = slam_map_of(site, camera)
         self.located = self.misplaced = False
-        self._n_off = 0
+        self._n_off = self._n_scale_off = 0
+        self._measured: Scale | None = None
+        """Scale that was compared last."""
         self._origin, self._is_live = origin, is_live
         self._world_from_site = world_from_site(site.georeference.origin, origin)
         self._to_say: list[tuple[str, str]] = []
@@ -69,7 +72,7 @@ class SiteUse:
 
     @property
     def left(self) -> SiteAccount:
-        """The map, as the flight is to leave it: without a place where satellites contradict it."""
+        """The map, as the flight is to leave it: without a place that measurements contradict."""
         found = self.site.georeference
         return (
             replace(self.site, georeference=replace(found, origin=None))
@@ -106,13 +109,11 @@ class SiteUse:
         """
         if placed is not None:
             units = self._world_from_site.scale / found.here_from_there.scale
-            off = abs(float(np.log(placed.world_from_map.scale / units)))
-            sigma = float(np.hypot(placed.sigma_scale, self.site.georeference.sigma_scale))
-            if off > max(MIN_SCALE_OFF, SIGMAS_OFF * sigma):
+            off = self._scale_off(units, placed.world_from_map.scale, placed.sigma_scale)
+            if off is not None:
                 self._say(
-                    CONTRADICTED, f"its scale is off by {100 * (np.exp(off) - 1):.0f} % from "
-                    f"that by {placed.method}",
-                )  # fmt: skip
+                    CONTRADICTED, f"its scale is off by {off:.0f} % from that by {placed.method}"
+                )
                 return False
         if measured_m is not None and self._is_live and self._origin is None:
             return False  # its place is compared as soon as the origin of what is measured is known
@@ -139,6 +140,30 @@ class SiteUse:
         if self.misplaced:
             self._say(DOUBTED, f"its place is {off_m:.0f} m from that by the autopilot")
         return self.misplaced
+
+    def compare_scale(self, placed: Georeference, measured: Scale) -> bool:
+        """True once accelerometers contradict the map's scale after the flight was located in it.
+
+        It is said. `placed` is the georeference of the map by the site's, `measured` its scale; one
+        counts once. The map is then as one of this flight, and has no place.
+        """
+        if measured is self._measured or self._n_scale_off == TIMES_OFF:
+            return False
+        self._measured = measured
+        off = self._scale_off(placed.world_from_map.scale, measured.scale, measured.sigma)
+        self._n_scale_off = 0 if off is None else self._n_scale_off + 1
+        if off is None or self._n_scale_off < TIMES_OFF:  # a young scale may leap
+            return False
+        self.misplaced = True
+        self._say(CONTRADICTED, f"its scale is off by {off:.0f} % from that by {measured.method}")
+        return True
+
+    def _scale_off(self, of_site: float, measured: float, sigma: float) -> float | None:
+        """Percent by which the map's scale is too large; None where `measured` may be the same."""
+        off = float(np.log(of_site / measured))
+        sigma = float(np.hypot(sigma, self.site.georeference.sigma_scale))
+        contradicts = abs(off) > max(MIN_SCALE_OFF, SIGMAS_OFF * sigma)
+        return 100.0 * (float(np.exp(off)) - 1.0) if contradicts else None
 
     def locate(self) -> None:
         """Note that the flight was found in the map."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from companion.estimation.georeference.trajectory_alignment import Scale
 from companion.estimation.site.site_of_flight import site_of_flight
 from companion.estimation.site.site_use import (
     CONTRADICTED,
@@ -109,6 +110,22 @@ def test_another_scale_is_said_and_not_used(slam_map: SlamMap, site: SiteMap) ->
     uncertain = replace(BY_GPS, sigma_scale=0.2)
     assert use.allowed(found_in(use, slam_map, 1.5), uncertain, None)
     assert use.allowed(found_in(use, slam_map, 1.5), None, None)
+
+
+def test_a_scale_that_accelerometers_contradict_later_is_said_and_given_up(site: SiteMap) -> None:
+    use = SiteUse(site, CAMERA, ORIGIN)
+    use.locate()
+    use.warnings(0)
+    units = use.georeference.world_from_map.scale
+    for ratio, sigma in ((1.05, 0.01), (1.3, 0.1), (1.3, 0.01), (1.3, 0.01), (1.0, 0.01)):
+        assert not use.compare_scale(use.georeference, Scale(units / ratio, sigma, "a", 9))
+    for n in range(3):
+        off = Scale(units / 1.3, 0.01, "accelerometers", 9)
+        assert use.compare_scale(use.georeference, off) == (n == 2)
+        assert not use.compare_scale(use.georeference, off), "one counts once"
+    (warning,) = use.warnings(0)
+    assert warning.what == CONTRADICTED and "30 % from that by acc" in warning.detail
+    assert use.left.georeference.origin is None and not use.georeference.has_origin
 
 
 def test_places_about_unknown_origins_are_not_compared(slam_map: SlamMap, site: SiteMap) -> None:
