@@ -125,8 +125,9 @@ class Daemon:
         self._notes = RecorderNotes(clock, flights, watch, self._link)
         if self._link is not None:
             self._reports = VehicleReports(
-                self._link, clock, watch, config, flights.take, flight_recording(config, flights)
-            )
+                self._link, clock, watch, config, flights.take,
+                flight_recording(config, flights, lambda: self._starts.end_flight()),
+            )  # fmt: skip
         self._starts = starts = FlightStarts(
             settings, self._feed, flights, self._senders, self._reports, watch, journal, self._stop,
             lambda why: self._on_warned(Warned(clock.now_ns(), NOT_BEGUN, why)),

@@ -90,6 +90,13 @@ class FlightStarts:
         """Begin a flight with a map of its own, where one is due."""
         self._begin_if_due(take_up=False)
 
+    def end_flight(self) -> bool:
+        """End the current flight, which another follows; False where it must go on: armed."""
+        if not self._on_ground or self.armed:
+            return False
+        self._give_way()
+        return True
+
     def camera_known(self) -> None:
         """Calibrate the camera by the size of its first frame, and begin a flight where one is due.
 

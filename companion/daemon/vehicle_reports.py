@@ -147,8 +147,8 @@ class VehicleReports:
         )  # fmt: skip
 
 
-def flight_recording(config: Config, flights: Flights) -> FlightRecording:
-    """Recording of the current flight, for a ground station."""
+def flight_recording(config: Config, flights: Flights, end: Callable[[], bool]) -> FlightRecording:
+    """Recording of the current flight, for a ground station; `end` ends it, if it may."""
 
     def is_kept() -> bool:
         flight = flights.current
@@ -160,4 +160,4 @@ def flight_recording(config: Config, flights: Flights) -> FlightRecording:
         flights.keep()
         return None if is_kept() else RECORDING_NO_FLIGHT()
 
-    return FlightRecording(is_kept, keep)
+    return FlightRecording(is_kept, keep, end)

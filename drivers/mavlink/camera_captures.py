@@ -1,7 +1,7 @@
 """Images and recordings on the word of a ground station, told as they are.
 
 A recording is that of the flight, which the daemon makes anyway: to start one keeps it, whether the
-motors are armed or not. It goes on until its flight ends, so that it cannot be stopped from here.
+motors are armed or not. To stop it ends its flight, which is denied while the motors are armed.
 The protocol: https://mavlink.io/en/services/camera.html.
 """
 
@@ -48,13 +48,17 @@ class Stills(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FlightRecording:
-    """Recording of the flight: whether one is kept, and how to keep one; None or why not."""
+    """Recording of the flight: whether one is kept, and how to keep and to end one.
+
+    `keep` returns None or why it cannot be; `end` False where the flight must go on.
+    """
 
     is_kept: Callable[[], bool]
     keep: Callable[[], PilotText | None]
+    end: Callable[[], bool]
 
 
-NOTHING_RECORDED = FlightRecording(lambda: False, RECORDING_NO_FLIGHT)
+NOTHING_RECORDED = FlightRecording(lambda: False, RECORDING_NO_FLIGHT, lambda: False)
 
 
 class CameraCaptures:
@@ -114,9 +118,10 @@ class CameraCaptures:
         return Done(ACCEPTED, [self._status()])
 
     def _stop(self, parameters: Sequence[float]) -> Done:
-        if not self._recording.is_kept():
-            return Done(ACCEPTED)
-        return Done(DENIED, [status_text(RECORDING_GOES_ON()), self._status()])
+        if self._recording.is_kept() and not self._recording.end():
+            return Done(DENIED, [status_text(RECORDING_GOES_ON()), self._status()])
+        self.step()
+        return Done(ACCEPTED, [self._status()])
 
     def _captured(self, still: Still) -> Any:
         """CAMERA_IMAGE_CAPTURED; place and attitude are in the recording, and not told here."""

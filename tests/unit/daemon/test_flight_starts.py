@@ -215,6 +215,17 @@ def test_a_flight_on_the_ground_gives_way_to_another(scene: Callable[..., Scene]
     assert made.flights.standby is None and not made.later.due
 
 
+def test_a_flight_is_ended_on_request_on_the_ground_only(scene: Callable[..., Scene]) -> None:
+    made = scene(by_arming=True)
+    made.starts.set_armed(True)
+    flight = made.flights.current
+    assert not made.starts.end_flight() and made.flights.current is flight
+    made.starts.set_armed(False)
+    assert made.starts.end_flight()
+    assert made.flights.current is not flight and not made.flights.current.kept
+    assert not scene().starts.end_flight(), "each flight lasts as long as the daemon"
+
+
 def test_a_process_restarted_in_the_air_keeps_its_flight(scene: Callable[..., Scene]) -> None:
     made = scene(by_arming=True)
     made.starts.set_armed(True)

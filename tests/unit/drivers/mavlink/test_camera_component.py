@@ -111,9 +111,15 @@ async def take_and_record(ground: Ground, flown: Flown) -> None:
     assert flown.kept
     status = await ground.of_camera("CAMERA_CAPTURE_STATUS")
     assert (status.video_status, status.image_count) == (1, 1)
+    flown.armed = True
     ground.ask(mavlink.MAV_CMD_VIDEO_STOP_CAPTURE, 0.0)
     assert await acknowledged(ground, mavlink.MAV_CMD_VIDEO_STOP_CAPTURE) == DENIED
     assert (await ground.of_camera("STATUSTEXT")).text == RECORDING_GOES_ON().text
+    assert (await ground.of_camera("CAMERA_CAPTURE_STATUS")).video_status == 1
+    flown.armed = False
+    ground.ask(mavlink.MAV_CMD_VIDEO_STOP_CAPTURE, 0.0)
+    assert await acknowledged(ground, mavlink.MAV_CMD_VIDEO_STOP_CAPTURE) == ACCEPTED
+    assert (await ground.of_camera("CAMERA_CAPTURE_STATUS")).video_status == 0
 
 
 @dataclass
@@ -122,6 +128,7 @@ class Flown:
 
     folder: Path
     kept: bool = False
+    armed: bool = False
 
     def __post_init__(self) -> None:
         self.stills = StillPictures(self.folder, 0.0)
@@ -130,7 +137,11 @@ class Flown:
         def keep() -> None:
             self.kept = True
 
-        return FlightRecording(lambda: self.kept, keep)
+        def end() -> bool:
+            self.kept &= self.armed
+            return not self.kept
+
+        return FlightRecording(lambda: self.kept, keep, end)
 
 
 class Datagrams(asyncio.DatagramProtocol):
