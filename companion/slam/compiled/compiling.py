@@ -1,11 +1,21 @@
-"""Compilation of the kernels by numba, and what spares it: code of the package, numba's cache."""
+"""Compilation of the kernels by numba, and what spares it: code of the package, numba's cache.
+
+What is in neither is compiled by a copy of this process that ends with it, because LLVM gives none
+of its memory back, 135 to 330 MB. A process with several threads cannot be copied, and compiles.
+"""
 
 from __future__ import annotations
 
+import functools
+import importlib
+import os
 import pickle
+import pkgutil
+import sys
+import traceback
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, TypeVar, cast
+from typing import Any, NoReturn, TypeVar, cast
 
 import llvmlite
 import numba
@@ -17,6 +27,7 @@ from numba.core.runtime.nrt import rtsys
 from numba.np.numpy_support import as_dtype
 from numpy.typing import NDArray
 
+from companion.slam import compiled as package
 from companion.slam.compiled.shipped_code import FOLDER, ShippedCode, circumstances
 
 Ints = NDArray[np.signedinteger[Any]]
@@ -47,6 +58,10 @@ HERE = circumstances(numba.__version__, llvmlite.__version__)
 """All that machine code depends on besides the processor."""
 shipped = ShippedCode(FOLDER, HERE)
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+WITHOUT_LOOPS = ("compiling", "ship", "shipped_code")
+"""Modules of the package that define none."""
+may_copy = True
+"""False where this process is to compile by itself."""
 _loops: dict[str, Any] = {}
 """Compiled loops, by `module.name`."""
 
@@ -95,14 +110,52 @@ def code_of_loops() -> dict[str, bytes]:
 class _NumbaCache(FunctionCache):
     """Numba's cache; loads without what compiling alone needs, which takes a tenth of a second."""
 
+    def __init__(self, loop: Callable[..., Any]) -> None:
+        super().__init__(loop)  # type: ignore[no-untyped-call]
+        self._is_of_package = loop.__module__.startswith(f"{package.__name__}.")
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         rtsys.initialize(target_context)
-        cache: Any = super()
-        with cache._guard_against_spurious_io_errors():
-            found = cache._load_overload(sig, target_context)
+        found = self._kept(sig, target_context)
+        if found is None and self._is_of_package and _compiled_by_a_copy():
+            found = self._kept(sig, target_context)
         if found is None:
             target_context.refresh()
         return found
+
+    def _kept(self, sig: Any, target_context: Any) -> Any:
+        cache: Any = super()
+        with cache._guard_against_spurious_io_errors():
+            return cache._load_overload(sig, target_context)
+
+
+@functools.cache
+def _compiled_by_a_copy() -> bool:
+    """Have a copy of this process compile all loops into the cache, once; True where it has."""
+    if not may_copy or len(os.listdir("/proc/self/task")) > 1:
+        return False
+    pid = os.fork()
+    if pid == 0:
+        _compile_all()
+    return os.waitpid(pid, 0)[1] == 0
+
+
+def _compile_all() -> NoReturn:
+    """Import all modules of the package anew, then end."""
+    global may_copy
+    may_copy, status = False, 1
+    try:
+        for module in pkgutil.iter_modules(package.__path__):
+            if module.name not in WITHOUT_LOOPS:
+                name = f"{package.__name__}.{module.name}"
+                sys.modules.pop(name, None)
+                importlib.import_module(name)
+        status = int(bool(cache_errors))
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(status)
 
 
 class _Given(NullCache):

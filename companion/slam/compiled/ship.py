@@ -23,14 +23,16 @@ from companion.slam.compiled import shipped_code
 def main() -> int:
     """Write the code of all loops beside them; the exit status."""
     shutil.rmtree(shipped_code.FOLDER, ignore_errors=True)  # what is loaded cannot be written
-    from companion.slam.compiled.compiling import HERE, code_of_loops
+    from companion.slam.compiled import compiling
 
+    compiling.may_copy = False  # what was loaded from a cache cannot be written again
     for module in pkgutil.iter_modules(compiled.__path__):
         importlib.import_module(f"{compiled.__name__}.{module.name}")
-    code = code_of_loops()
-    shipped_code.write(shipped_code.FOLDER, code, HERE)
+    code = compiling.code_of_loops()
+    shipped_code.write(shipped_code.FOLDER, code, compiling.HERE)
     size_kb = sum(map(len, code.values())) >> 10
-    print(f"{shipped_code.FOLDER}: {len(code)} loops for any {HERE['architecture']}, {size_kb} kB")
+    architecture = compiling.HERE["architecture"]
+    print(f"{shipped_code.FOLDER}: {len(code)} loops for any {architecture}, {size_kb} kB")
     return 0
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,21 @@ from companion.slam.compiled.compiling import compiled, number, numbers
 @compiled(numbers, number)
 def scaled(values, by):
     return values * by / 0.0
+"""
+
+IN_A_PACKAGE = """
+import sys, threading
+import companion.slam.compiled as package
+from companion.slam.compiled import compiling
+
+package.__path__ = [sys.argv[1]]
+if sys.argv[2] == "two threads":
+    threading.Thread(target=threading.Event().wait, daemon=True).start()
+from companion.slam.compiled import loops_of_a_test
+
+assert loops_of_a_test.scaled([1.0], 3.0)[0] == float("inf")
+assert compiling.cache_errors == []
+print(len(compiling._loops["loops_of_a_test.scaled"].stats.cache_misses))
 """
 
 
@@ -54,6 +71,18 @@ def test_corrupt_cache_is_recompiled(tmp_path: Path, cache_errors: list[str]) ->
     kept.write_bytes(kept.read_bytes()[:100])
     assert np.isnan(module_in(tmp_path).scaled(np.zeros(3), 1.0)).all()
     assert len(cache_errors) == 1 and cache_errors[0].startswith("scaled: ")
+
+
+@pytest.mark.parametrize(("threads", "n_compiled"), [("one thread", 0), ("two threads", 1)])
+def test_process_of_one_thread_does_not_compile_itself(
+    tmp_path: Path, threads: str, n_compiled: int
+) -> None:
+    """A copy of it does, which takes the compiler's memory with it; threads cannot be copied."""
+    (tmp_path / "loops_of_a_test.py").write_text(TEXT, "utf-8")
+    command = [sys.executable, "-c", IN_A_PACKAGE, str(tmp_path), threads]
+    told = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (told.returncode, told.stderr) == (0, "")
+    assert int(told.stdout) == n_compiled
 
 
 def test_without_a_cache_folder_kernels_are_compiled(
