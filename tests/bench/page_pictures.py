@@ -4,7 +4,8 @@
 
 Flies the camera and the autopilot of the tests in real time: the mount is found by hand and the
 lens calibrated, with pictures while each goes on; then the other views, in flight and after it.
-Prints what each view is wider than its screen by, and what the browser complained of.
+Prints what each view is wider than its screen by, and what the browser complained of. Once all
+parts are there, OUT has docs/page_views.webp too.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from companion.page.codes import shown
 from tests.live.test_set_up_in_browser import boards, in_hands
 from tests.support.browser import Browser
@@ -22,6 +25,8 @@ from tests.support.processes.paged import Paged
 
 SCREENS = {"phone": (390, 844), "desk": (1280, 800)}
 LONG_MS = 200_000
+SHEET = ("lens_6", "mount_found", "map", "flight", "settings")
+SHEET_SCREEN, SHEET_GAP = (260, 563), 12
 
 
 class Operator:
@@ -54,6 +59,8 @@ class Operator:
             self.page.set_viewport_size({"width": width, "height": height})
             self.page.wait_for_timeout(300)  # it draws anew
             self.page.screenshot(path=self._out / f"{name}_{screen}.png", full_page=True)
+            if screen == "phone" and name in SHEET:
+                self.page.screenshot(path=self._out / f"{name}_sheet.png")
             over = self.page.evaluate("document.documentElement.scrollWidth") - width
             print(f"{name}, {screen}: {max(over, 0)} pixels too wide")
         print(*self._browser.complaints, sep="\n", end="", flush=True)
@@ -114,6 +121,19 @@ def look_around(operator: Operator, paged: Paged) -> None:
     operator.take("flight")
 
 
+def write_sheet(out: Path) -> None:
+    """Write the views of docs/page.md side by side, where all were taken."""
+    files = [out / f"{name}_sheet.png" for name in SHEET]
+    if not all(file.exists() for file in files):
+        return
+    width, height = SHEET_SCREEN
+    sheet = Image.new("RGB", (len(files) * (width + SHEET_GAP) - SHEET_GAP, height), "white")
+    for n, file in enumerate(files):
+        with Image.open(file) as view:
+            sheet.paste(view.convert("RGB").resize(SHEET_SCREEN), (n * (width + SHEET_GAP), 0))
+    sheet.save(out / "page_views.webp", quality=80)
+
+
 PARTS = {"mount": find_the_mount, "lens": calibrate_the_lens, "views": look_around}
 
 
@@ -134,6 +154,7 @@ def main() -> None:
                 operator = Operator(paged, browser, arguments.out)
                 operator.pair()
                 part(operator, paged)
+    write_sheet(arguments.out)
 
 
 if __name__ == "__main__":
