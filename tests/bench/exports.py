@@ -4,6 +4,8 @@
 
 RUN is the --out of a replay of FLIGHT. Both are aligned by the best similarity of their paths.
 Mesh: points drawn evenly from its triangles, and those of the cloud, against the true surface.
+Points that no true depth image has within its borders are not judged: there the true surface is
+not known. Their share is printed.
 Orthomosaics: windows of 6 m against what the true images show when they are put on the true
 surface by true poses; a shift is that of the best phase correlation.
 """
@@ -32,7 +34,15 @@ from companion.products.export.surface import surface_of
 from companion.products.run_folder import FinishedRun, read_run
 from drivers.open_flight import open_flight
 from tests.bench import cloud as cloud_bench
-from tests.support.reference.scoring import Alignment, Array, Trajectory, read_tum, score
+from tests.support.reference.scoring import (
+    Alignment,
+    Array,
+    Trajectory,
+    read_lens,
+    read_tum,
+    score,
+    true_depths,
+)
 
 NEAR_M, FOUND_M = 0.15, 0.5
 N_DRAWN = 200_000
@@ -41,7 +51,9 @@ LEAST_KNOWN = 0.95
 LEAST_RESPONSE = 0.2
 
 
-def mesh_line(run: FinishedRun, alignment: Alignment, surface: Array) -> str:
+def mesh_line(
+    flight: Path, run: FinishedRun, truth: Trajectory, alignment: Alignment, surface: Array
+) -> str:
     began_s = time.monotonic()
     mesh = mesh_of(run.cloud)
     took_s = time.monotonic() - began_s
@@ -49,18 +61,40 @@ def mesh_line(run: FinishedRun, alignment: Alignment, surface: Array) -> str:
     made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     on_mesh, _ = trimesh.sample.sample_surface(made, N_DRAWN, seed=0)
     true = KDTree(surface)
-    shares = []
+    shares, judged_share = [], []
     for points in (np.asarray(on_mesh), run.cloud.points.astype(np.float64)):
         aligned = alignment(points)
-        off_m, _ = true.query(cloud_bench.drawn(aligned), workers=-1)
+        some = cloud_bench.drawn(aligned)
+        judged = in_true_images(some, flight, truth)
+        off_m, _ = true.query(some[judged], workers=-1)
         to_it_m, _ = KDTree(aligned).query(cloud_bench.drawn(surface), workers=-1)
         shares += [np.mean(off_m < NEAR_M), np.mean(to_it_m < FOUND_M)]
+        judged_share.append(f"{100 * judged.mean():.1f} %")
     near, found, cloud_near, cloud_found = (f"{100 * share:.1f} %" for share in shares)
     return (
         f"mesh: cells {mesh.cell:g} m, {len(mesh.faces)} triangles, {took_s:.0f} s, "
         f"{memory_gb:.2f} GB; within {NEAR_M} m {near}, surface found within {FOUND_M} m {found}; "
-        f"the cloud {cloud_near} and {cloud_found}"
+        f"the cloud {cloud_near} and {cloud_found}; "
+        f"judged {' and '.join(judged_share)} of the points"
     )
+
+
+def in_true_images(points: Array, flight: Path, truth: Trajectory) -> NDArray[np.bool_]:
+    """Which points (N, 3) of the true world lie within the borders of a true depth image."""
+    matrix, lens = read_lens(flight)
+    there = np.zeros(len(points), bool)
+    for index, depth_m in true_depths(flight):
+        seen = (points - truth.centres[index]) @ truth.rotations[index]
+        # wider than any of the lenses: beyond it a distortion may fold back into the image
+        ahead = np.flatnonzero((seen[:, 2] > 0.1) & (np.abs(seen[:, :2]) < seen[:, 2:]).all(1))
+        if not len(ahead):
+            continue
+        pixels, _ = cv2.projectPoints(seen[ahead], np.zeros(3), np.zeros(3), matrix, lens)
+        u, v = np.asarray(pixels)[:, 0].T
+        inside = (u >= -0.5) & (u < depth_m.shape[1] - 0.5)
+        inside &= (v >= -0.5) & (v < depth_m.shape[0] - 0.5)
+        there[ahead[inside]] = True
+    return there
 
 
 def true_places(
@@ -148,7 +182,7 @@ def main() -> None:
     alignment = score(read_tum(options.run / "trajectory.tum"), truth).alignment
     cloud_bench.EVERY_PIXEL = 1  # 0.15 m is as far as one third of the pixels lie apart
     surface, _ = cloud_bench.true_surface(options.flight, truth)
-    print(mesh_line(run, alignment, surface), flush=True)
+    print(mesh_line(options.flight, run, truth, alignment, surface), flush=True)
     print(mosaic_lines(options.flight, run, truth, alignment))
 
 
