@@ -31,10 +31,14 @@ REACH_CELLS = 2.5
 LEAST_NEIGHBOURS = 3
 TRIM_CELLS = 1.2
 """The surface goes so far beyond its points."""
+N_AROUND, MOST_ASIDE = 8, 0.8
+"""It is kept farther from them where they lie around it: the mean of the nearest is not farther
+away than this share of their mean distance. Beyond the border of a plane that is 1."""
 N_ROUGH, N_SPREAD = 12, 2
-MOST_ROUGH = 0.15
+MOST_ROUGH = 0.2
 """Cells by which the planes of the nearest points may scatter, once smoothed: beyond it points are
 of no surface, or of a wrong one."""
+N_COLOURS = 4
 N_SPACING = 2000
 CELLS_PER_SPACING = 2.0
 MAX_CELLS = 400_000_000
@@ -181,13 +185,15 @@ def _trimmed(vertices: Array, faces: Ints, tree: cKDTree, cloud: Cloud, cell: fl
     """Without what lies beyond the points or is too rough, with the colours of the nearest."""
     if not len(faces):
         raise InputError("no surface could be found in the cloud")
-    away, index = tree.query(vertices, k=4)
-    good = away[:, 0] < TRIM_CELLS * cell
+    away, index = tree.query(vertices, k=N_AROUND)
+    aside = np.linalg.norm(cloud.points[index].mean(1) - vertices, axis=1)
+    good = (away[:, 0] < TRIM_CELLS * cell) | (aside < MOST_ASIDE * away.mean(1))
     good &= _roughness(vertices, faces, tree, cloud) < MOST_ROUGH * cell
     faces = faces[good[faces].all(1)]
     if not len(faces):
         raise InputError("no surface could be found in the cloud: its points scatter too much")
     used, faces = np.unique(faces, return_inverse=True)
-    weight = 1.0 / np.maximum(away[used], 0.1 * cell)
-    rgb = (weight[..., None] * cloud.rgb[index[used]]).sum(1) / weight.sum(1, keepdims=True)
+    weight = 1.0 / np.maximum(away[used, :N_COLOURS], 0.1 * cell)
+    colours = weight[..., None] * cloud.rgb[index[used, :N_COLOURS]]
+    rgb = colours.sum(1) / weight.sum(1, keepdims=True)
     return Mesh(vertices[used], faces.reshape(-1, 3), np.rint(rgb).astype(np.uint8), cell)
