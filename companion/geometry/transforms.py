@@ -119,7 +119,11 @@ def skew(v: Array) -> Array:
 def nearest_rotation(matrix: Array) -> Array:
     """The nearest rotation to a matrix (3, 3), to remove accumulated rounding errors."""
     u, _, vt = np.linalg.svd(matrix)
-    out: Array = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    out: Array = u @ vt
+    (a, b, c), (d, e, f), (g, h, i) = out.tolist()
+    if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0.0:
+        u[:, 2] *= -1.0
+        out = u @ vt
     return out
 
 

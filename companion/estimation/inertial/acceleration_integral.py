@@ -21,11 +21,13 @@ from companion.estimation.inertial.steady_level import SteadyLevel
 from companion.estimation.inertial.turn_integral import TurnIntegral
 from companion.estimation.sample_series import SampleSeries
 from companion.geometry.geodesy import STANDARD_GRAVITY_M_S2
-from companion.geometry.transforms import Array, rotation_from_quaternion
+from companion.geometry.transforms import Array
+from companion.slam.compiled.inertial_steps import integrated, rotation_between
 from companion.telemetry import AttitudeSample, ImuSample
 
 GRAVITY_NED_M_S2 = np.array([0.0, 0.0, STANDARD_GRAVITY_M_S2])
 """Differences from it on earth count as bias."""
+_NO_ROWS = np.zeros((4, 3))
 MAX_GAP_NS = 100_000_000
 """Longer without a sample, nothing is integrated across."""
 NO_GAP = 1e-6
@@ -186,7 +188,7 @@ class AccelerationIntegral:
                 self._last = None
                 continue
             share = (sample.t_ns - before.t_ns) / span_ns
-            rotation = rotation_from_quaternion(first + share * (second - first))
+            rotation = rotation_between(first, second, share)
             if self._own_level:
                 if self._last is None or sample.t_ns - self._last[0] > MAX_GAP_NS:
                     self.level.reset()
@@ -195,20 +197,20 @@ class AccelerationIntegral:
             elif self._lever_body_m is not None:
                 self._lever[0] = rotation @ np.cross(sample.gyro_rad_s, self._lever_body_m)
                 self._lever[1] = rotation @ self._lever_body_m
-            self._add(sample.t_ns, rotation @ sample.accel_m_s2 + GRAVITY_NED_M_S2, rotation)
+            self._add(sample.t_ns, sample.accel_m_s2, rotation)
 
-    def _add(self, t_ns: int, acceleration_m_s2: Array, rotation: Array) -> None:
+    def _add(self, t_ns: int, accel_m_s2: Array, rotation: Array) -> None:
         """Trapezoidal rule; displacement with acceleration linear between samples."""
-        now = np.empty((4, 3))
-        now[0], now[1:] = acceleration_m_s2, -rotation
-        last, self._last = self._last, (t_ns, now)
-        if last is None or not 0 < t_ns - last[0] <= MAX_GAP_NS:
+        dt_s, was = 0.0, _NO_ROWS
+        if self._last is None or not 0 < t_ns - self._last[0] <= MAX_GAP_NS:
             self._n_gaps += 1
         else:
-            dt_s, was = (t_ns - last[0]) * 1e-9, last[1]
+            dt_s, was = (t_ns - self._last[0]) * 1e-9, self._last[1]
             self._interval_s += (dt_s - self._interval_s) / NOISE_TAU
-            self._displacement += self._velocity * dt_s + (2.0 * was + now) * (dt_s * dt_s / 6.0)
-            self._velocity += (was + now) * (dt_s / 2.0)
+        now = integrated(
+            rotation, accel_m_s2, GRAVITY_NED_M_S2, was, dt_s, self._velocity, self._displacement
+        )
+        self._last = t_ns, now
         if self._series.takes(t_ns):
             self._series.add(t_ns, self._newest_sums())
 

@@ -20,8 +20,8 @@ from companion.geometry.transforms import (
     nearest_rotation,
     rotation_from_vector,
     vector_from_rotation,
-    yaw_rotation,
 )
+from companion.slam.compiled.inertial_steps import led_level
 
 SIGMA_AUTOPILOT_RAD, AUTOPILOT_S = float(np.radians(0.15)), 20.0
 """Of the autopilot's level, and for how long it is off by the same."""
@@ -141,17 +141,10 @@ class SteadyLevel:
             self._rotation, self._apart_rad = autopilot, 0.0
             return autopilot
         dt_s = regular_s((t_ns - last[0]) * 1e-9, self._turns.interval_s)
-        mean = 0.5 * (last[1] + rates) - self._bias
-        rotation = self._rotation @ rotation_from_vector(dt_s * mean)
-        apart = autopilot @ rotation.T
-        # about the vertical it is the autopilot's
-        rotation = yaw_rotation(float(np.arctan2(
-            apart[1, 0] - apart[0, 1], apart[0, 0] + apart[1, 1]
-        ))) @ rotation  # fmt: skip
-        off = vector_from_rotation(autopilot @ rotation.T)
-        self._apart_rad = float(np.hypot(off[0], off[1]))
         gain = 1.0 if less_biases else min(self.lead_hz * dt_s, 1.0)
-        self._rotation = rotation_from_vector(gain * off) @ rotation
+        self._rotation, self._apart_rad = led_level(
+            self._rotation, autopilot, last[1], rates, self._bias, dt_s, gain
+        )
         if t_ns - self._images_ns > IMAGES_LAST_S * 1e9 and t_ns - self._seen_ns > 1e8:
             self._learn(t_ns, autopilot, BY_AUTOPILOT, SIGMA_AUTOPILOT_RAD, AUTOPILOT_S)
         return self._rotation

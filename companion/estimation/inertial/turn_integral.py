@@ -7,7 +7,8 @@ from math import isfinite
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.geometry.transforms import Array, rotation_from_vector
+from companion.geometry.transforms import Array
+from companion.slam.compiled.inertial_steps import turned
 from companion.telemetry import ImuSample
 
 MAX_GAP_NS = 100_000_000
@@ -58,8 +59,7 @@ class TurnIntegral:
                 if regular != dt_s:
                     self.interval_s += (dt_s - self.interval_s) / TAU
                 self._see_noise(rates - self._rates[last], regular)
-                turn = 0.5 * regular * (self._rates[last] + rates)
-                rotation = rotation @ rotation_from_vector(turn)
+                rotation = turned(rotation, self._rates[last], rates, regular)
         self._t_ns[self._n], self._rotations[self._n] = sample.t_ns, rotation
         self._rates[self._n], self._gaps[self._n] = rates, gaps
         self._n += 1

@@ -48,8 +48,8 @@ large_word, half_word, small_integer = types.uint64, types.uint32, types.int32
 tiny_word = types.uint8
 single_pairs, words = given(types.float32, 2), given(large_word, 2)
 images, patches = given(types.uint8, 2), given(types.uint8, 3)
-tiny_words_out = types.Array(types.uint8, 1, "C")
-"""Filled by the kernel; to be contiguous, as a copy would be filled instead."""
+tiny_words_out, pairs_out = types.Array(types.uint8, 1, "C"), types.Array(number, 2, "C")
+"""Changed by the kernel; to be contiguous, as a copy would be changed instead."""
 
 
 cache_errors: list[str] = []

@@ -33,6 +33,8 @@ MIN_SPREAD = 2.0
 MIN_SCALE, MAX_SCALE = 0.6, 1.6
 _SIDE = 2 * HALF + 1
 _AREA = float(_SIDE * _SIDE)
+_ONES = np.ones(_SIDE * _SIDE)
+_1, _2, _3 = (np.uintp(k) for k in range(1, 4))
 
 
 @part
@@ -54,12 +56,23 @@ def _template(stored: Bytes, centre: Array, patch_from_image: Array, out: Array)
 
 
 @part
+def _dot(a: Array, b: Array) -> float:
+    """Sum of products, in four sums that do not wait for each other."""
+    s0 = s1 = s2 = s3 = 0.0
+    for k in range(0, len(a) - 3, 4):
+        i = np.uintp(k)
+        s0 += a[i] * b[i]
+        s1 += a[i + _1] * b[i + _1]
+        s2 += a[i + _2] * b[i + _2]
+        s3 += a[i + _3] * b[i + _3]
+    for k in range(len(a) // 4 * 4, len(a)):
+        s0 += a[k] * b[k]
+    return (s0 + s1) + (s2 + s3)
+
+
+@part
 def _without_mean(values: Array) -> None:
-    total = 0.0
-    for i in range(_SIDE):
-        for j in range(_SIDE):
-            total += values[i, j]
-    values -= total / _AREA
+    values -= _dot(values, _ONES) / _AREA
 
 
 @part
@@ -74,7 +87,7 @@ def _sample(image: Bytes, x: float, y: float, out: Array) -> bool:
     for i in range(_SIDE):
         top, left = row + i - HALF, column - HALF
         for j in range(_SIDE):
-            out[i, j] = (
+            out[i * _SIDE + j] = (
                 a * image[top, left + j]
                 + b * image[top, left + j + 1]
                 + c * image[top + 1, left + j]
@@ -96,23 +109,18 @@ def _fit(
     wide = np.empty((_SIDE + 2, _SIDE + 2))
     if not _template(stored, centre, patch_from_image, wide):
         return False
-    inner, gx, gy, seen = work[0], work[1], work[2], work[3]
+    inner, gx, gy, seen, error = work[0], work[1], work[2], work[3], work[4]
     for i in range(_SIDE):
         for j in range(_SIDE):
-            inner[i, j] = wide[i + 1, j + 1]
-            gx[i, j] = 0.5 * (wide[i + 1, j + 2] - wide[i + 1, j])
-            gy[i, j] = 0.5 * (wide[i + 2, j + 1] - wide[i, j + 1])
+            k = i * _SIDE + j
+            inner[k] = wide[i + 1, j + 1]
+            gx[k] = 0.5 * (wide[i + 1, j + 2] - wide[i + 1, j])
+            gy[k] = 0.5 * (wide[i + 2, j + 1] - wide[i, j + 1])
     _without_mean(inner)
     _without_mean(gx)
     _without_mean(gy)
-    variance, a, b, c = 0.0, 0.0, 0.0, 0.0
-    for i in range(_SIDE):
-        for j in range(_SIDE):
-            variance += inner[i, j] * inner[i, j]
-            a += gx[i, j] * gx[i, j]
-            b += gx[i, j] * gy[i, j]
-            c += gy[i, j] * gy[i, j]
-    spread, a, b, c = np.sqrt(variance / _AREA), a / _AREA, b / _AREA, c / _AREA
+    spread = np.sqrt(_dot(inner, inner) / _AREA)
+    a, b, c = _dot(gx, gx) / _AREA, _dot(gx, gy) / _AREA, _dot(gy, gy) / _AREA
     least = 0.5 * (a + c) - np.sqrt(0.25 * (a - c) * (a - c) + b * b)
     if not (least > MIN_TEXTURE and spread > MIN_SPREAD):
         return False
@@ -122,21 +130,13 @@ def _fit(
         if not _sample(image, position[0], position[1], seen):
             return False
         _without_mean(seen)
-        square = 0.0
-        for i in range(_SIDE):
-            for j in range(_SIDE):
-                square += seen[i, j] * seen[i, j]
-        contrast = max(np.sqrt(square / _AREA), 1e-3)
+        contrast = max(np.sqrt(_dot(seen, seen) / _AREA), 1e-3)
         gain = spread / contrast
-        ex, ey, correlation = 0.0, 0.0, 0.0
-        for i in range(_SIDE):
-            for j in range(_SIDE):
-                error = seen[i, j] * gain - inner[i, j]
-                ex += gx[i, j] * error
-                ey += gy[i, j] * error
-                correlation += seen[i, j] * inner[i, j]
-        ex, ey = ex / _AREA, ey / _AREA
-        zncc = correlation / _AREA / (contrast * spread)
+        for i in range(len(error)):
+            at = np.uintp(i)
+            error[at] = seen[at] * gain - inner[at]
+        ex, ey = _dot(gx, error) / _AREA, _dot(gy, error) / _AREA
+        zncc = _dot(seen, inner) / _AREA / (contrast * spread)
         step_x = min(max((c * ex - b * ey) / det, -1.0), 1.0)
         step_y = min(max((a * ey - b * ex) / det, -1.0), 1.0)
         position[0] -= step_x
@@ -156,7 +156,7 @@ def align(
 ) -> tuple[Array, Bools]:  # fmt: skip
     """Alignment of patches, see `companion.slam.features.patches.align`."""
     found, sure = pixels.copy(), np.zeros(len(pixels), np.bool_)
-    back, position, work = np.empty((2, 2)), np.empty(2), np.empty((4, _SIDE, _SIDE))
+    back, position, work = np.empty((2, 2)), np.empty(2), np.empty((5, _SIDE * _SIDE))
     for i in range(len(pixels)):
         warp = image_from_patch[i]
         det = warp[0, 0] * warp[1, 1] - warp[0, 1] * warp[1, 0]

@@ -147,6 +147,21 @@ def _sums(
             information[k, m] = information[m, k]
 
 
+@part
+def _straightened(rotation: Array) -> Array:
+    """A rotation without what rounding added: of that only the square is left."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        for k in range(3):
+            out[i, k] = 1.5 * rotation[i, k]
+            for m in range(3):
+                along = 0.0
+                for n in range(3):
+                    along += rotation[n, m] * rotation[n, k]
+                out[i, k] -= 0.5 * rotation[i, m] * along
+    return out
+
+
 @compiled(pairs, numbers, pairs, pairs, matrices, integer, integer)
 def refine(
     rotation: Array, translation: Array, points: Array, seen: Array, whitening: Array,
@@ -183,4 +198,5 @@ def refine(
         for i in range(len(points)):
             u, v, depth = _whitened(rotated, moved, points[i], seen[i], whitening[i])
             inlier[i] = u * u + v * v < CHI2_2D and depth > 0.0
-    return rotated, moved, inlier, information
+    # a pose is refined from one predicted from the last: what rounding adds would grow with each
+    return _straightened(rotated), moved, inlier, information

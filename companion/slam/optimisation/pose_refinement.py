@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from companion.geometry.transforms import Array, Pose, nearest_rotation
+from companion.geometry.transforms import Array, Pose
 from companion.slam.compiled.pose_kernels import CHI2_2D, HUBER, cost, refine
 from companion.slam.features.orb_features import Bools
 
@@ -54,5 +54,4 @@ def refine_pose(
         camera_from_map.rotation, camera_from_map.translation,
         points_map, normalised, whitening, rounds, iterations,
     )  # fmt: skip
-    # a pose is refined from one predicted from the last: what rounding adds would grow with each
-    return Pose(nearest_rotation(rotation), translation), inlier, information
+    return Pose(rotation, translation), inlier, information
