@@ -32,8 +32,8 @@ class RemoteViewing:
             start_alone,
             Supervisor(setup, self._hear, self._say_restarted, lambda why: None, lambda why: None),
         )
+        self._processes.start()  # the exporter itself begins with the flight, and is heard then
         self._viewing = Viewing(config, lambda: self._processes.by_name[VIEWERS], warn)
-        self._processes.start()
         self._processes.fly()
 
     def take(self, message: Message) -> None:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.estimation.body.limits import SIGMA_JERK_M_S3
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral, Change
 from companion.estimation.inertial.inertial_motion import (
     BIAS,
@@ -38,8 +39,6 @@ in seven minutes."""
 UNMEASURED_M_S2 = 1.5
 """White acceleration where none is measured, per root of Hz: a copter that gains and loses 1 m/s2
 and more for a second."""
-SIGMA_JERK_M_S3 = 10.0
-"""Of an acceleration that is taken to stay: a copter that tilts by 60 degrees in a second."""
 
 
 class BodyState(NamedTuple):

@@ -8,14 +8,12 @@ import numpy as np
 
 from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.body.body_state import Reckoned
+from companion.estimation.body.limits import CONTRADICTS_SIGMAS
 from companion.estimation.body.reckoned_path import BodyPlace, ReckonedPath
 from companion.geometry.transforms import Array, Pose
 
 MAX_SIGMA_M = 5.0
 """Beyond, it is of no use even to find the map again."""
-CONTRADICTS_SIGMAS = 4.0
-"""Beyond, a map that is off from inertial navigation is wrong, not navigation; what that was off by
-without aid in the firmwares' simulators was 2.5 of them at most."""
 GOOD_SIGMA_M = 0.5
 """As long as it is this certain, it counts for more than a map that is poor."""
 FAIR_SIGMA_M = 1.0

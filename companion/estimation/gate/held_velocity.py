@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimation.body.body_state import SIGMA_JERK_M_S3
+from companion.estimation.body.limits import SIGMA_JERK_M_S3
 from companion.messages import Odometry
 
 SIGMA_ACCELERATION_M_S2 = 3.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.estimation.body.reckoning import CONTRADICTS_SIGMAS
+from companion.estimation.body.limits import CONTRADICTS_SIGMAS
 from companion.estimation.gate.pose_rules import NO_ATTITUDE
 from companion.messages import Odometry
 

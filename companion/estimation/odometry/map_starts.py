@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.estimation.body.reckoning import CONTRADICTS_SIGMAS
+from companion.estimation.body.limits import CONTRADICTS_SIGMAS
 from companion.estimation.odometry.odometry_course import OdometryCourse
 from companion.estimation.odometry.odometry_frame import MapView, OdometryState
 from companion.estimation.odometry.placed_map import PlacedMap, frame_of

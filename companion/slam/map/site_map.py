@@ -88,7 +88,7 @@ class SiteMap:
 
     @property
     def account(self) -> SiteAccount:
-        """What is left to be known once it is in use."""
+        """The site map but for its keyframes and points, which lie in a map once it is in use."""
         ids = (k.keyframe_id for k in self.keyframes)
         part_of_id = dict(zip(ids, self.part_of.tolist(), strict=True))
         return SiteAccount(self.revision, self.parts, part_of_id, self.georeference)

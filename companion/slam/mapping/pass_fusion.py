@@ -39,6 +39,10 @@ def fuse_passes(slam_map: SlamMap, projector: Projector) -> int:
     )
     fewer = slam_map.n_observers[pairs[:, 0]] < slam_map.n_observers[pairs[:, 1]]
     pairs[fewer] = pairs[fewer, ::-1]
+    # what a keyframe that lies in a file observes stays as it is
+    named = slam_map.is_named[pairs]
+    pairs[named[:, 1]] = pairs[named[:, 1], ::-1]
+    pairs = pairs[~named.all(1)]
     apart_px, sure = align_points(slam_map, pairs[:, 0], pairs[:, 1], MAX_APART_PX)
     unite(slam_map, pairs[sure, 0], pairs[sure, 1], apart_px[sure])
     return int(np.count_nonzero(sure))

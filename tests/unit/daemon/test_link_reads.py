@@ -26,6 +26,8 @@ class Published:
         self.all: list[Any] = []
         self.over = self.hurried = False
 
+    def start(self) -> None: ...
+
     def fly(self) -> None: ...
 
     def publish(self, parcel: Parcel) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from companion.config import FeedbackConfig, Measurement
-from companion.estimation.body.body_state import SIGMA_JERK_M_S3
+from companion.estimation.body.limits import SIGMA_JERK_M_S3
 from companion.estimation.gate.pose_gate import PoseGate, Sending
 from companion.estimation.gate.pose_to_send import PoseToSend
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
