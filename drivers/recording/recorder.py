@@ -191,6 +191,7 @@ class Recorder:
             self._skips_until_intra = not self._disk.put(entry, "pictures", is_picture=True)
             if self._skips_until_intra:
                 self._encoder.request_intra()
+                return  # a frame of two pictures is one that was dropped
 
     def _link(self, taken: LinkBytes) -> None:
         self._put(SENT if taken.outgoing else RECEIVED, taken.t_ns, link_bytes(taken))
