@@ -152,7 +152,8 @@ class Daemon:
         if config.page.listen:
             self._page = PageChild(
                 config, source, own_socket_path(config.daemon.socket), self._service.is_there,
-                journal, lambda: settings.armed, self._checks.reload, self._stop,
+                journal, lambda: settings.armed, self._checks.reload, watch.keep_viewer,
+                self._stop,
             )  # fmt: skip
         self._recovery = RecordingRecovery(
             Path(config.daemon.flights), clock, self._on_warned, lambda: starts.reported_armed
@@ -280,6 +281,8 @@ class Daemon:
             self._senders.take(sample)
         if isinstance(sample, ArmedSample):
             self._starts.set_armed(sample.armed)
+            if sample.armed:
+                self._watch.armed()
 
     def _reconfigured(self, old: Config, config: Config) -> None:
         self._checks.reconfigure(old, config)

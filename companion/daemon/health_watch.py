@@ -40,6 +40,9 @@ BUSY_STUCK_NS, BUSY_CORES = 10_000_000_000, 0.02
 """The same where it uses the processor, by so many cores at least: the computer is overloaded."""
 START_S = 120.0
 """Longest start of localisation; the first of all may compile its loops."""
+VIEWER_KEPT_NS = 5_000_000_000
+"""The viewer is kept for so long after a view of the setup has asked for its pictures: it asks five
+times a second, the page passes that on every two seconds."""
 PATIENCE_NS = 20_000_000_000
 """Time with frames but no track, after a restart of localisation, before the daemon gives up."""
 NO_SIGN_S = 10.0
@@ -82,6 +85,8 @@ class HealthWatch:
         self._governed_ns = 0
         self._settled_ns = 0
         self._n_dropped = 0
+        self._viewer_until_ns = 0
+        """Time until which the viewer is kept, at any load level."""
         self._last_frame_ns = 0
         self._odometry: Odometry | None = None
         self._odometry_ns = 0
@@ -101,7 +106,7 @@ class HealthWatch:
     @property
     def too_hot(self) -> bool:
         """True while the load level is reduced because of the temperature."""
-        return "hot" in self._governor.degraded
+        return "hot" in self._governor.why
 
     def reconfigure(self, config: Config) -> None:
         """Apply a changed configuration."""
@@ -119,6 +124,14 @@ class HealthWatch:
         self._odometry, self._scale, self._n_dropped = None, "", 0
         self._odometry_ns = self._clock.now_ns()
         self._governed_ns = 0
+
+    def keep_viewer(self) -> None:
+        """Keep the viewer's pictures for some seconds; the motors are disarmed."""
+        self._viewer_until_ns = self._clock.now_ns() + VIEWER_KEPT_NS
+
+    def armed(self) -> None:
+        """Take that the motors are armed: at any load the pose has priority again."""
+        self._viewer_until_ns = 0
 
     def frame_came(self, t_ns: int) -> None:
         """Count a frame of this time; from the camera's thread."""
@@ -202,6 +215,10 @@ class HealthWatch:
 
     def _step_governor(self) -> None:
         flight, now_ns = self._flights.current, self._clock.now_ns()
+        keeps_viewer = now_ns < self._viewer_until_ns
+        if keeps_viewer != self._governor.keeps_viewer:
+            self._governor.keeps_viewer = keeps_viewer
+            self._apply()
         if flight is None or not flight.ready or now_ns < self._settled_ns:
             return
         n_dropped = flight.stages["localisation"].n_dropped

@@ -1,8 +1,9 @@
 """Process of the page for browsers: started, started again, and heard.
 
-The page can ask for two things, each a line on its standard output: that the configuration be read
-again, and that the daemon be started anew. Neither is done while armed. It ends with its standard
-input, and so with the daemon, however that ends.
+The page can ask for three things, each a line on its standard output: that the configuration be
+read again, that the daemon be started anew, and that the viewer be kept under load, since a step of
+the setup needs its pictures. None is done while armed. It ends with its standard input, and so with
+the daemon, however that ends.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from companion.daemon.stop_request import StopRequest
 from drivers.system.journal import INFO, WARNING, Journal
 
 PAGE = "companion.page.page_process"
-RELOAD, RESTART = b"reload\n", b"restart\n"
+RELOAD, RESTART, VIEWER = b"reload\n", b"restart\n", b"viewer\n"
 """Lines that the page may write."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 2.0, 60.0
 """Pause before it is started again; doubled while it ends soon."""
@@ -40,12 +41,14 @@ class SettingsSource:
 class PageChild:
     """Keeps the page of `page.listen` there. Used in the event loop.
 
-    `armed` tells whether the motors are; `reload` has the configuration read again.
+    `armed` tells whether the motors are; `reload` has the configuration read again, `keep_viewer`
+    the viewer kept for some seconds.
     """
 
     def __init__(
         self, config: Config, source: SettingsSource, socket: Path, supervised: bool,
-        journal: Journal, armed: Callable[[], bool], reload: Callable[[], None], stop: StopRequest,
+        journal: Journal, armed: Callable[[], bool], reload: Callable[[], None],
+        keep_viewer: Callable[[], None], stop: StopRequest,
     ) -> None:  # fmt: skip
         facts = {
             "config": to_toml(config),
@@ -56,6 +59,7 @@ class PageChild:
         }
         self._facts = json.dumps(facts).encode() + b"\n"
         self._journal, self._armed, self._reload, self._stop = journal, armed, reload, stop
+        self._keep_viewer = keep_viewer
 
     async def run(self) -> None:
         """Start it, and again when it has ended; ends by cancellation, and the page with it."""
@@ -95,9 +99,12 @@ class PageChild:
             await child.wait()
 
     def _take(self, line: bytes) -> None:
-        if line not in (RELOAD, RESTART):
+        if line == VIEWER:
+            if not self._armed():
+                self._keep_viewer()
+        elif line not in (RELOAD, RESTART):
             return
-        if self._armed():
+        elif self._armed():
             self._journal.say(f"page: no {line.decode().strip()}: the motors are armed", WARNING)
         elif line == RELOAD:
             self._reload()

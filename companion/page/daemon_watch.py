@@ -12,6 +12,7 @@ from companion.timing.clock import monotonic_s
 from drivers.system.status_socket import ask_status
 
 FRESH_S = 0.8
+KEEP_VIEWER_EVERY_S = 2.0
 
 
 class DaemonWatch:
@@ -21,6 +22,7 @@ class DaemonWatch:
         self._socket = socket
         self._lock = asyncio.Lock()
         self._asked_s = -FRESH_S
+        self._kept_s = -KEEP_VIEWER_EVERY_S
         self._document: dict[str, Any] = {}
         self.problem = ""
         """Reason why the daemon does not answer; "" where it does."""
@@ -53,7 +55,13 @@ class DaemonWatch:
         size = self._document.get("size")
         return (int(size[0]), int(size[1])) if size else None
 
+    def keep_viewer(self) -> None:
+        """Ask the daemon, no more often than needed, to keep the viewer's pictures under load."""
+        if monotonic_s() - self._kept_s > KEEP_VIEWER_EVERY_S:
+            self._kept_s = monotonic_s()
+            self.order("viewer")
+
     def order(self, word: str) -> None:
-        """Ask the daemon to `reload` or to `restart`."""
+        """Ask the daemon to `reload`, to `restart`, or to keep the `viewer`."""
         sys.stdout.write(f"{word}\n")
         sys.stdout.flush()

@@ -1,14 +1,15 @@
 """Load governor: load levels for a computer that is too busy or too hot, in a fixed order.
 
-First the viewer is reduced, then the dense map, then features. The pose has priority: the last
-level gives it less work per frame, not fewer frames. One level at a time, each with time to take
+First the viewer is reduced, then the dense map, then features; on the ground the viewer keeps its
+pictures while a step of the setup needs them. The pose has priority: the last level gives it less
+work per frame, not fewer frames. One level at a time, each with time to take
 effect before the next. With hysteresis: a level is lowered after some time with headroom, and later
 each time that this turns out to have been too early.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 MAX_POSE_LATENCY_MS = 60.0
 """From the arrival of a frame to its pose, 95th percentile: cameras are 10 to 60 ms late by
@@ -42,22 +43,30 @@ class Level:
     """Work allowed at one level. `dense_share` of keyframes get a depth map."""
 
     number: int
-    left_out: str
     viewer: bool = True
     dense_share: float = 1.0
     feature_share: float = 1.0
 
+    @property
+    def left_out(self) -> str:
+        """Work left out, in words; "" for none."""
+        parts = (("viewer", not self.viewer), ("dense map", not self.dense_share))
+        off = " and ".join(name for name, is_off in parts if is_off)
+        words = [f"{off} off"] if off else []
+        if 0 < self.dense_share < 1:
+            words.append("dense map reduced")
+        if self.feature_share < 1:
+            words.append("fewer features")
+        return ", ".join(words)
+
 
 LEVELS = (
-    Level(0, ""),
-    Level(1, "viewer off", viewer=False),
-    Level(2, "viewer off, dense map reduced", viewer=False, dense_share=0.5),
-    Level(3, "viewer and dense map off", viewer=False, dense_share=0.0),
-    Level(
-        4, "viewer and dense map off, fewer features",
-        viewer=False, dense_share=0.0, feature_share=0.6,
-    ),
-)  # fmt: skip
+    Level(0),
+    Level(1, viewer=False),
+    Level(2, viewer=False, dense_share=0.5),
+    Level(3, viewer=False, dense_share=0.0),
+    Level(4, viewer=False, dense_share=0.0, feature_share=0.6),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +89,9 @@ class Governor:
     def __init__(self, hot_c: float, max_pose_latency_ms: float = MAX_POSE_LATENCY_MS) -> None:
         self._hot_c = hot_c
         self._max_latency_ms = max_pose_latency_ms
-        self.level = LEVELS[0]
+        self._level = LEVELS[0]
+        self.keeps_viewer = False
+        """True while somebody needs its pictures, whatever the level."""
         self.why = ""
         """Reason of the present level, in words."""
         self._raised_ns: int | None = None
@@ -90,9 +101,15 @@ class Governor:
         self._overloaded_since_ns: int | None = None
 
     @property
+    def level(self) -> Level:
+        """Work allowed now."""
+        return replace(self._level, viewer=True) if self.keeps_viewer else self._level
+
+    @property
     def degraded(self) -> str:
-        """Work left out, and the reason; "" at level 0."""
-        return f"{self.level.left_out}, {self.why}" if self.level.number else ""
+        """Work left out, and the reason; "" where nothing is."""
+        left_out = self.level.left_out
+        return f"{left_out}, {self.why}" if left_out else ""
 
     def step(self, t_ns: int, sample: LoadSample) -> bool:
         """Take a measurement; whether the level has changed."""
@@ -110,13 +127,13 @@ class Governor:
             return False
         if self._headroom_since_ns is None:
             self._headroom_since_ns = t_ns
-        if self.level.number and t_ns - self._headroom_since_ns >= self._recovery_s * 1e9:
+        if self._level.number and t_ns - self._headroom_since_ns >= self._recovery_s * 1e9:
             self._lower(t_ns)
             return True
         return False
 
     def _raise(self, t_ns: int, why: str, settle_s: float) -> bool:
-        if self.level is LEVELS[-1]:
+        if self._level is LEVELS[-1]:
             return False
         if self._raised_ns is not None and t_ns - self._raised_ns < settle_s * 1e9:
             return False
@@ -129,14 +146,14 @@ class Governor:
             elif forgotten:
                 self._recovery_s = RECOVERY_S
             self._lowered_ns = None
-        self.level, self.why = LEVELS[self.level.number + 1], why
+        self._level, self.why = LEVELS[self._level.number + 1], why
         self._raised_ns = t_ns
         return True
 
     def _lower(self, t_ns: int) -> None:
-        self.level = LEVELS[self.level.number - 1]
+        self._level = LEVELS[self._level.number - 1]
         self._lowered_ns = self._headroom_since_ns = t_ns
-        if not self.level.number:
+        if not self._level.number:
             self.why = ""
 
     def _overload(self, sample: LoadSample) -> tuple[str, float]:

@@ -130,8 +130,9 @@ if (picture) {
   const focus = document.querySelector("[data-focus]");
   const context = picture.getContext("2d", { willReadFrequently: Boolean(focus) });
   let number = -1, best = 0, sinceMs = 0;
+  const needed = "needed" in picture.dataset ? "&needed" : "";
   again(200, async () => {
-    const answer = await ask(`/now/picture?after=${number}`);
+    const answer = await ask(`/now/picture?after=${number}${needed}`);
     if (answer.status === 204) {
       if (performance.now() - sinceMs > 5000 && number >= 0) {
         text.textContent = "No new picture for some seconds: this is an old one.";

@@ -54,6 +54,8 @@ class NowViews:
 
     async def _picture(self, request: Request) -> Response:
         await self._site.watch.status()  # which tells where the exporter is
+        if "needed" in request.query_params:  # by a step of the setup
+            self._site.watch.keep_viewer()
         after = request.query_params.get("after", "")
         found = self._site.scene.picture_after(int(after) if is_number(after) else -1)
         if found is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 
 from companion.config import Config
-from companion.daemon.health_watch import PATIENCE_NS, HealthWatch
+from companion.daemon.health_watch import PATIENCE_NS, VIEWER_KEPT_NS, HealthWatch
 from companion.health import SourceHealth
 from companion.messages import Odometry, TrackState
 from companion.meters import LatencyMeter
@@ -107,3 +108,37 @@ def test_a_camera_that_is_late_by_itself_is_no_load(tmp_path: Path) -> None:
                 watch.take_odometry(pose)
             watch._step_governor()
         assert len(levels) == n_levels
+
+
+@pytest.mark.parametrize("is_armed", [True, False])
+def test_a_viewer_whose_pictures_are_needed_is_kept_under_load_until_the_motors_are_armed(
+    is_armed: bool, tmp_path: Path
+) -> None:
+    viewer: list[bool] = []
+    flight = SimpleNamespace(
+        ready=True,
+        stages={"localisation": SimpleNamespace(n_dropped=0)},
+        set_load_levels=lambda features, dense, kept: viewer.append(kept),
+    )
+    watch, clock = watch_of(flight, tmp_path), FlightClock()
+    watch._clock = clock
+    second = itertools.count(1)
+
+    def late(n: int) -> None:
+        for _ in range(n):
+            now_ns = next(second) * 1_000_000_000
+            clock.now_ns = lambda now_ns=now_ns: now_ns  # type: ignore[method-assign,misc]
+            watch._recent.add(now_ns, 80.0)
+            watch._step_governor()
+
+    watch.keep_viewer()
+    late(1)
+    watch.keep_viewer()
+    late(4)
+    assert len(viewer) > 2 and all(viewer)
+    if is_armed:
+        watch.armed()
+    else:
+        late(VIEWER_KEPT_NS // 1_000_000_000)
+    late(1)
+    assert viewer[-1] is False

@@ -1,4 +1,4 @@
-"""The page's process: two words are heard of it, none while armed, and it ends with the daemon."""
+"""The page's process: three words are heard, none while armed, and it ends with the daemon."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ async def heard(
     stop, said = StopRequest(journal), ""
     child = PageChild(
         load_config(None, [f"daemon.flights={words}"]), SettingsSource(), Path("status.sock"), True,
-        journal, lambda: armed, lambda: reloads.append("reload"), stop,
+        journal, lambda: armed, lambda: reloads.append("reload"),
+        lambda: reloads.append("viewer"), stop,
     )  # fmt: skip
     task = asyncio.ensure_future(child.run())
     try:
@@ -44,16 +45,16 @@ async def heard(
         await asyncio.gather(task, return_exceptions=True)
 
 
-def test_it_may_ask_for_two_things(capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_may_ask_for_three_things(capsys: pytest.CaptureFixture[str]) -> None:
     reloads, stop, _ = asyncio.run(
-        heard("reload,format the disk,reload,restart", False, lambda r, s, _: s.made, capsys)
+        heard("reload,format the disk,viewer,reload,restart", False, lambda r, s, _: s.made, capsys)
     )
-    assert reloads == ["reload"] * 2 and stop.status == RESTART and stop.hurried
+    assert reloads == ["reload", "viewer", "reload"] and stop.status == RESTART and stop.hurried
 
 
 def test_but_for_nothing_while_armed(capsys: pytest.CaptureFixture[str]) -> None:
     reloads, stop, said = asyncio.run(
-        heard("restart,reload", True, lambda r, s, said: "no reload" in said, capsys)
+        heard("restart,viewer,reload", True, lambda r, s, said: "no reload" in said, capsys)
     )
     assert not reloads and not stop.made and "no restart: the motors are armed" in said
 

@@ -75,6 +75,18 @@ def test_a_warning_comes_with_what_to_do(served: ServedPage) -> None:
     assert "silent" not in text and "is back" not in text and "<b>" not in text
 
 
+def test_steps_that_need_the_picture_ask_the_daemon_to_keep_it(
+    served: ServedPage, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for path in ("/setup", "/setup/lens", "/setup/mount"):
+        assert '<canvas id="picture" data-needed ' in here(served, path).text
+    here(served, "/now/picture?after=-1")
+    assert capfd.readouterr().out == ""
+    for _ in range(3):
+        here(served, "/now/picture?after=-1&needed")
+    assert capfd.readouterr().out == "viewer\n"
+
+
 def test_pictures_and_map_are_empty_before_there_are_any(served: ServedPage) -> None:
     assert here(served, "/now/picture?after=-1").status == 204
     assert json.loads(here(served, "/now/above").body)["metric"] is False

@@ -43,6 +43,19 @@ def test_late_poses_take_one_step_at_a_time_to_the_last() -> None:
     assert governor.degraded == ("viewer and dense map off, fewer features, since poses take 80 ms")
 
 
+def test_a_viewer_that_is_needed_is_kept_and_the_others_give_way() -> None:
+    governor = Governor(hot_c=85)
+    governor.keeps_viewer = True
+    assert run(governor, range(2), LATE) == [(1, 1)]
+    assert governor.level.viewer and governor.degraded == ""
+    run(governor, range(2, 60), LATE)
+    assert governor.level.viewer and governor.level.dense_share == 0.0
+    assert governor.degraded == "dense map off, fewer features, since poses take 80 ms"
+    governor.keeps_viewer = False
+    assert governor.level is LEVELS[-1]
+    assert governor.degraded == "viewer and dense map off, fewer features, since poses take 80 ms"
+
+
 def test_one_late_second_is_no_reason() -> None:
     governor = Governor(hot_c=85)
     assert run(governor, range(60), lambda t, _: LATE if t % 2 else EASY) == []
