@@ -21,7 +21,7 @@ from companion.daemon.stop_request import BAD_INPUT, StopRequest
 from companion.daemon.vehicle_reports import VehicleReports
 from companion.errors import CompanionError
 from companion.geometry.camera import Camera
-from companion.runtime.processes import in_words
+from companion.runtime.in_processes import in_words
 from drivers.camera.camera_feed import CameraFeed
 from drivers.camera.live_calibration import live_camera
 from drivers.system.journal import WARNING, Journal

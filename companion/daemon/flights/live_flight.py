@@ -33,8 +33,8 @@ from companion.messages import (
     Warned,
 )
 from companion.messages.run_facts import RunFacts
+from companion.runtime.in_processes import InProcesses, Supervisor, in_words
 from companion.runtime.parcel import Parcel
-from companion.runtime.processes import Processes, Supervisor, in_words
 from companion.runtime.stage_outbox import GATHER_S
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import (
@@ -113,7 +113,7 @@ class LiveFlight:
         """True once the map is georeferenced to the autopilot's origin."""
         self._dense = makes_depth(config)
         self._dense_share = 1.0
-        self._processes = Processes(
+        self._processes = InProcesses(
             stages_of(config),
             start,
             Supervisor(

@@ -9,8 +9,8 @@ from companion.config import Config
 from companion.daemon.flights.viewing import VIEWERS, Viewing
 from companion.geometry.camera import Camera
 from companion.messages import Message
+from companion.runtime.in_processes import InProcesses, Supervisor
 from companion.runtime.parcel import Parcel
-from companion.runtime.processes import Processes, Supervisor
 from companion.runtime.stage_protocol import Finish, Listening, Setup
 from companion.runtime.stage_start import start_alone
 from companion.runtime.stages import Stage, stage_named
@@ -27,7 +27,7 @@ class RemoteViewing:
 
         row = stage_named(VIEWERS)
         self._listens = row.listens
-        self._processes = Processes(
+        self._processes = InProcesses(
             [row],
             start_alone,
             Supervisor(setup, self._hear, self._say_restarted, lambda why: None, lambda why: None),

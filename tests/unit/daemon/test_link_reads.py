@@ -40,7 +40,7 @@ class Published:
 
 @pytest.fixture
 def flight(monkeypatch: pytest.MonkeyPatch) -> LiveFlight:
-    monkeypatch.setattr(module, "Processes", Published)
+    monkeypatch.setattr(module, "InProcesses", Published)
     nothing: Any = SimpleNamespace(unusable=None)
     flying = LiveFlight(Config(), CAMERA, FlightClock(), lambda _: nothing, nothing)
     flying._processes.by_name = {}

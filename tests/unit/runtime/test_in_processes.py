@@ -19,8 +19,8 @@ import pytest
 from companion.config import Config
 from companion.messages import MapUpdate
 from companion.runtime import stage_start
+from companion.runtime.in_processes import LONGEST_WAIT_S, InProcesses, Supervisor, pause_s
 from companion.runtime.parcel import Parcel
-from companion.runtime.processes import LONGEST_WAIT_S, Processes, Supervisor, pause_s
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Finish, SetLoadLevel, Setup
 from companion.runtime.stage_start import Child, Start, start_alone
@@ -66,7 +66,7 @@ class Flight:
     ) -> None:
         self.heard, self._folder = Heard(), folder
         note = self.heard.note
-        self.processes = Processes(
+        self.processes = InProcesses(
             rows or STAGES,
             start,
             Supervisor(

@@ -43,7 +43,7 @@ class Supervisor:
     """A stage could never start because of the user's input."""
 
 
-class Processes:
+class InProcesses:
     """Processes of the given stages, from `start` on.
 
     `publish` may be called from any thread, and never waits. What a stage's own thread changes is
