@@ -12,7 +12,7 @@ from typing import ClassVar, get_args
 
 from companion.config import MEASUREMENTS, Measurement
 from companion.geometry.transforms import Array
-from companion.telemetry_schema import QUATERNION, VECTOR, WHERE_TRUE, Schema, fields_of
+from companion.sample_schema import QUATERNION, VECTOR, WHERE_TRUE, Schema, fields_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,8 +32,8 @@ from companion.messages import (
     SiteMapUsed,
     Warned,
 )
+from companion.sample_schema import Field
 from companion.telemetry import FIELDS, TELEMETRY, Telemetry
-from companion.telemetry_schema import Field
 from drivers.recording.recording_topics import (
     MapOfBefore,
     MavlinkBytes,

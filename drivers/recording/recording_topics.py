@@ -20,8 +20,8 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
+from companion.sample_schema import Field
 from companion.telemetry import FIELDS, TELEMETRY, ArmedSample, Telemetry
-from companion.telemetry_schema import Field
 from drivers.recording.mcap_writer import McapWriter
 
 PROFILE = "companion"

@@ -21,8 +21,8 @@ import numpy as np
 from companion.errors import FlightError
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import ClockReport, Warned
+from companion.sample_schema import Field
 from companion.telemetry import FIELDS, TELEMETRY, PositionSample, PositionSource, Telemetry
-from companion.telemetry_schema import Field
 from drivers.telemetry.telemetry_log import LogContent, TelemetryCollector, TelemetryLog, kind_of
 
 NAME = "telemetry.csv"

@@ -1,4 +1,4 @@
-"""Schema of a telemetry message: codec, recording topic, CSV columns and curve follow from it.
+"""Schema of a kind of sample, one of `telemetry`: codec, recording topic, columns and curve follow.
 
 A message states its `Schema`. Its fields are those of its dataclass: numbers, flags, words of an
 `Enum`, and arrays, whose size is in the metadata; what may be missing is `| None`.

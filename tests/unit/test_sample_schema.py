@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from companion.sample_schema import fields_of
 from companion.telemetry import (
     TELEMETRY,
     ArmedSample,
@@ -23,7 +24,6 @@ from companion.telemetry import (
     RangeSample,
     Telemetry,
 )
-from companion.telemetry_schema import fields_of
 from drivers.recording.recorded_content import sample_bytes, sample_of, sample_topic
 from drivers.recording.recording_topics import open_channels
 from drivers.telemetry.telemetry_csv import read_telemetry_csv, telemetry_csv
