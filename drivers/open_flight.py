@@ -18,7 +18,7 @@ from drivers.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from drivers.datasets.video_flight import is_video, open_video
 from drivers.flight import Flight
 from drivers.images.calibration_file import with_mount, with_readout
-from drivers.recording.recorded_flight import (
+from drivers.recording.recording_as_flight import (
     is_recorded_folder,
     is_recording,
     open_recorded_folder,

@@ -27,7 +27,7 @@ from drivers.recording.flights_folder import (
     may_go,
     recordings_in,
 )
-from drivers.recording.recording import with_pictures
+from drivers.recording.recording_reader import with_pictures
 from drivers.recording.trimming import trim
 
 MB = 1 << 20

@@ -23,7 +23,7 @@ from companion.config_file import shown
 from companion.errors import CompanionError, InputError
 from companion.products.atomic_file import write_atomically
 from drivers.recording.flights_folder import flown_in, recordings_in
-from drivers.recording.recording import with_pictures
+from drivers.recording.recording_reader import with_pictures
 from drivers.system.status_socket import ask_status, found_socket_path
 
 JOURNAL_LINES = 2000

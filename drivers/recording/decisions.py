@@ -40,9 +40,9 @@ from companion.telemetry import Telemetry
 from drivers.mavlink.measurements.pose_messages import FRAMES
 from drivers.mavlink.vehicle import Firmware
 from drivers.mavlink.wire.packet_stream import MavlinkStream
-from drivers.recording.recorded_content import is_sample_topic, sample_of
 from drivers.recording.recorder import CONFIG_TOML, NOTES
-from drivers.recording.recording import Recording
+from drivers.recording.recording_codec import is_sample_topic, sample_of
+from drivers.recording.recording_reader import RecordingReader
 from drivers.recording.recording_topics import (
     EVENTS,
     GATES,
@@ -118,7 +118,7 @@ class Decisions:
         return "other"
 
 
-def decisions_of(recording: Recording) -> Decisions:
+def decisions_of(recording: RecordingReader) -> Decisions:
     """Decisions of a recorded flight; FlightError where it has none."""
     toml = recording.found.attachments.get(CONFIG_TOML)
     if toml is None:

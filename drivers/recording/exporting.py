@@ -25,8 +25,8 @@ from companion.errors import FlightError
 from drivers.mavlink.wire.packet_stream import MavlinkStream
 from drivers.recording.flights_folder import TLOG
 from drivers.recording.picture_codec import still
-from drivers.recording.recorded_flight import telemetry_of
-from drivers.recording.recording import PicturePlace, Recording
+from drivers.recording.recording_as_flight import telemetry_of
+from drivers.recording.recording_reader import PicturePlace, RecordingReader
 from drivers.recording.recording_topics import IMAGE, RECEIVED, SENT, VIDEO, MavlinkBytes
 from drivers.telemetry.telemetry_csv import NAME, telemetry_csv
 
@@ -34,7 +34,7 @@ MICROSECONDS = Fraction(1, 1_000_000)
 NAMES = {"jpeg": "jpg", "png": "png"}
 
 
-def export(recording: Recording, out: Path, on_progress: Callable[[int], None]) -> None:
+def export(recording: RecordingReader, out: Path, on_progress: Callable[[int], None]) -> None:
     """Write a recording with images as the folder `out`; `on_progress` takes the images done.
 
     FlightError where it cannot be written, or is not empty.
@@ -62,7 +62,7 @@ def export(recording: Recording, out: Path, on_progress: Callable[[int], None]) 
     (out / "frames.csv").write_text("\n".join(lines) + "\n")
 
 
-def tlog(recording: Recording) -> bytes:
+def tlog(recording: RecordingReader) -> bytes:
     """All packets of the link, in both directions, in the format of ground stations."""
     streams = {RECEIVED: MavlinkStream(), SENT: MavlinkStream()}
     out = []
@@ -82,7 +82,7 @@ def tlog(recording: Recording) -> bytes:
     return b"".join(out)
 
 
-def _images(recording: Recording, folder: Path, on_progress: Callable[[int], None]) -> None:
+def _images(recording: RecordingReader, folder: Path, on_progress: Callable[[int], None]) -> None:
     folder.mkdir()
     for number, place in enumerate(recording.pictures):
         topic, data = recording.picture_data(place)
@@ -98,7 +98,7 @@ def _images(recording: Recording, folder: Path, on_progress: Callable[[int], Non
 
 
 def _video(
-    recording: Recording, path: Path, on_progress: Callable[[int], None]
+    recording: RecordingReader, path: Path, on_progress: Callable[[int], None]
 ) -> list[PicturePlace]:
     """Remux the images of a video, from the first intra picture on, into an MP4 file."""
     places = recording.pictures

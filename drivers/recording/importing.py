@@ -15,14 +15,14 @@ from drivers.images.camera_document import camera_document
 from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
 from drivers.recording.picture_codec import picture_encoder
-from drivers.recording.recorded_content import (
+from drivers.recording.recorder import CAMERA_JSON, NOTES
+from drivers.recording.recording_codec import (
     calibration_bytes,
     event_bytes,
     json_bytes,
     sample_bytes,
     sample_topic,
 )
-from drivers.recording.recorder import CAMERA_JSON, NOTES
 from drivers.recording.recording_topics import CALIBRATION, EVENTS, HEALTH, PROFILE, open_channels
 
 CHUNK_BYTES = 4_000_000

@@ -12,7 +12,7 @@ from google.protobuf.message import DecodeError
 
 from companion.config import RecorderConfig
 from companion.messages import Bytes, Frame
-from drivers.recording.recorded_content import serialised, set_time
+from drivers.recording.recording_codec import serialised, set_time
 from drivers.recording.recording_topics import GREY, IMAGE, RAW
 
 FRAME_ID = "camera"

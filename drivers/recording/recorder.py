@@ -36,7 +36,7 @@ from drivers.recording.flights_folder import RECORDING, TLOG
 from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
 from drivers.recording.picture_codec import EncodedPicture, picture_encoder
-from drivers.recording.recorded_content import (
+from drivers.recording.recording_codec import (
     calibration_bytes,
     cloud_bytes,
     decision_bytes,

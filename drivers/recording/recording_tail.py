@@ -21,8 +21,8 @@ from drivers.recording.flights_folder import recordings_in
 from drivers.recording.mcap_file import DAMAGED, RECORD, McapFile, McapMessage, as_stream
 from drivers.recording.mcap_writer import MAGIC
 from drivers.recording.picture_codec import grey_of, still
-from drivers.recording.recorded_content import is_sample_topic, sample_of
 from drivers.recording.recorder import CAMERA_JSON
+from drivers.recording.recording_codec import is_sample_topic, sample_of
 from drivers.recording.recording_topics import PICTURES, VIDEO
 from drivers.system.status_socket import ask_status
 

@@ -9,7 +9,7 @@ from companion.errors import FlightError
 from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_file import McapMessage
 from drivers.recording.mcap_writer import McapWriter
-from drivers.recording.recording import Recording
+from drivers.recording.recording_reader import RecordingReader
 from drivers.recording.recording_topics import (
     FROM_PICTURES,
     LASTING,
@@ -25,7 +25,11 @@ CHUNK_BYTES = 4 << 20
 
 
 def trim(
-    recording: Recording, start_ns: int, stop_ns: int, out: Path, on_progress: Callable[[int], None]
+    recording: RecordingReader,
+    start_ns: int,
+    stop_ns: int,
+    out: Path,
+    on_progress: Callable[[int], None],
 ) -> int:
     """Write start_ns <= time < stop_ns to a new file; the number of images in it.
 
@@ -56,7 +60,7 @@ def trim(
 
 
 def _copy(
-    recording: Recording, pictures: set[tuple[int, int]], span_ns: tuple[int, int],
+    recording: RecordingReader, pictures: set[tuple[int, int]], span_ns: tuple[int, int],
     writer: McapWriter, on_progress: Callable[[int], None],
 ) -> None:  # fmt: skip
     channels = open_channels(writer)

@@ -14,7 +14,7 @@ from google.protobuf.message import DecodeError
 from companion.config import RecorderConfig
 from companion.messages import Bytes, Frame
 from drivers.recording.picture_codec import FRAME_ID, EncodedPicture
-from drivers.recording.recorded_content import serialised, set_time
+from drivers.recording.recording_codec import serialised, set_time
 from drivers.recording.recording_topics import VIDEO
 from drivers.video.h264_encoder import H264Encoder, H264Picture, is_intra
 

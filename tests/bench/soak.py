@@ -35,7 +35,7 @@ from companion.config import CameraConfig
 from companion.daemon.control.ground_control import NEW_MAP
 from companion.errors import CompanionError
 from drivers.open_flight import open_flight
-from drivers.recording.recording import Recording
+from drivers.recording.recording_reader import RecordingReader
 from tests.support.autopilot.fake_autopilot import FakeAutopilot
 from tests.support.autopilot.fake_flight import RecordedFlight
 from tests.support.autopilot.fake_wire import free_port
@@ -105,7 +105,7 @@ def looked_at(began_s: float, lap: int, daemon: Daemon, process: psutil.Process)
 
 def lap_of(number: int, folder: Path, autopilot: FakeAutopilot) -> dict[str, Any]:
     """What a lap left behind; its folder is deleted."""
-    with contextlib.closing(Recording(folder / "flight.mcap")) as recording:
+    with contextlib.closing(RecordingReader(folder / "flight.mcap")) as recording:
         seqs = [place.seq for place in recording.pictures]
         whole = not recording.warnings
     report = json.loads((folder / "report.json").read_text())

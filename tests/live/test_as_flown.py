@@ -12,7 +12,7 @@ from companion.estimation.gate.global_gate import IN_USE
 from companion.estimation.gate.proof import MAP_RESUMED
 from companion.estimation.site.site_use import LOCATED
 from drivers.recording.decisions import decisions_of
-from drivers.recording.recorded_flight import open_recording
+from drivers.recording.recording_as_flight import open_recording
 from tests.support.flights.halting import Halting
 from tests.support.processes.as_flown import ENOUGH, again
 from tests.support.processes.flying import Flying

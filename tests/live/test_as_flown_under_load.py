@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.config import CameraConfig, TelemetryConfig
 from companion.telemetry import MEASURED, PositionSample
 from drivers.recording.decisions import decisions_of
-from drivers.recording.recorded_flight import open_recording
+from drivers.recording.recording_as_flight import open_recording
 from tests.support.processes.as_flown import ENOUGH, again
 from tests.support.processes.flying import Flying
 

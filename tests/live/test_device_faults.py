@@ -9,7 +9,7 @@ import pytest
 
 from companion.dense.device_takeover import FAILED_OVER, NO_DEVICE_LEFT
 from companion.pilot_messages import MAP_OTHER_DEVICE
-from drivers.recording.recording import Recording
+from drivers.recording.recording_reader import RecordingReader
 from drivers.recording.recording_topics import EVENTS
 from tests.support.processes.daemon_process import UNGOVERNED
 from tests.support.processes.flying import Flying
@@ -48,7 +48,7 @@ def test_in_flight_the_next_device_takes_over_and_the_pose_goes_on(
         flying.until_stage("localisation", lambda it: it["rate_hz"] > 0 and not it["n_restarted"])
         flying.assert_stops()
         (folder,) = flying.daemon.flown()
-    recording = Recording(folder / "flight.mcap")
+    recording = RecordingReader(folder / "flight.mcap")
     chunks = range(len(recording.found.chunks))
     events = b"".join(
         bytes(each.data) for n in chunks for each in recording.messages(n)

@@ -21,8 +21,8 @@ from drivers.recording.disk_writer import FAILED
 from drivers.recording.flights_folder import recordings_in
 from drivers.recording.mcap_file import McapFile
 from drivers.recording.mcap_scan import summary
-from drivers.recording.recorded_flight import RecordedFlight
-from drivers.recording.recording import CUT
+from drivers.recording.recording_as_flight import RecordedFlight
+from drivers.recording.recording_reader import CUT
 from drivers.telemetry.tlog_records import TlogRecords
 from tests.support.autopilot.fake_autopilot import FakeAutopilot
 from tests.support.autopilot.fake_flight import MadeUpFlight

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivers.recording.recording import Recording
+from drivers.recording.recording_reader import RecordingReader
 from tests.support.processes.daemon_process import Daemon
 
 ANSWER_S, UP_S = 4.0, 120.0
@@ -71,5 +71,5 @@ def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path) -> None:
     for part in (folder, folder / "part-2"):
         assert (part / "flight.rrd").stat().st_size > 10_000
         # the first is mended, which it was not closed for
-        with closing(Recording(part / "flight.mcap")) as recording:
+        with closing(RecordingReader(part / "flight.mcap")) as recording:
             assert recording.pictures

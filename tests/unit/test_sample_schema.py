@@ -24,7 +24,7 @@ from companion.telemetry import (
     RangeSample,
     Telemetry,
 )
-from drivers.recording.recorded_content import sample_bytes, sample_of, sample_topic
+from drivers.recording.recording_codec import sample_bytes, sample_of, sample_topic
 from drivers.recording.recording_topics import open_channels
 from drivers.telemetry.telemetry_csv import read_telemetry_csv, telemetry_csv
 from drivers.telemetry.telemetry_log import TelemetryLog

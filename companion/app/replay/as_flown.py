@@ -45,7 +45,7 @@ from companion.products.site_map_file import digest_of, map_path, read_head, rea
 from companion.timing.clock import StageTimes
 from drivers.recording.decisions import Decisions, decisions_of
 from drivers.recording.flights_folder import RECORDING
-from drivers.recording.recorded_flight import RecordedFlight, open_recording
+from drivers.recording.recording_as_flight import RecordedFlight, open_recording
 
 AS_FLOWN = "as_flown.json"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from companion.flight_notes import GateStep
 from drivers.recording.decisions import step_of
-from drivers.recording.recorded_content import decision_bytes
+from drivers.recording.recording_codec import decision_bytes
 
 
 def recorded(step: GateStep) -> GateStep:

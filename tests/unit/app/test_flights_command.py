@@ -14,7 +14,7 @@ from companion.telemetry import ArmedSample
 from drivers.open_flight import open_flight
 from drivers.recording import trimming
 from drivers.recording.importing import write_recording
-from drivers.recording.recorded_flight import RecordedFlight
+from drivers.recording.recording_as_flight import RecordedFlight
 from tests.support.flights.recorded import STEP_NS, record
 
 FIRST, SECOND = "2026-01-01T00-00-00Z", "2026-01-02T00-00-00Z"

@@ -38,7 +38,7 @@ from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.vehicle import Firmware, Vehicle
 from drivers.recording.decisions import Decisions, payloads_of, points_of, step_of
-from drivers.recording.recorded_content import decision_bytes, obstacle_points_bytes
+from drivers.recording.recording_codec import decision_bytes, obstacle_points_bytes
 from tests.support.autopilot.memory_link import SetClock, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
 from tests.unit.obstacles.test_newest_sight import SCENE

@@ -20,9 +20,9 @@ from companion.runtime.stage_start import start_alone
 from companion.runtime.stages import stage_named
 from companion.telemetry import AttitudeSample
 from drivers.recording.flights_folder import RECORDING
-from drivers.recording.recorded_content import decision_bytes
-from drivers.recording.recorded_flight import open_recording
 from drivers.recording.recorder import Recorder
+from drivers.recording.recording_as_flight import open_recording
+from drivers.recording.recording_codec import decision_bytes
 from drivers.recording.recording_topics import LANDING
 from tests.support.flights.marker_ground import MarkerGround, looking_at_marker
 from tests.support.processes.stage_heard import SOON_S, Heard

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 
 from companion.messages import Odometry, TrackState
 from drivers.recording.mcap_writer import McapWriter
-from drivers.recording.recorded_content import odometry_bytes
+from drivers.recording.recording_codec import odometry_bytes
 from drivers.recording.recording_topics import (
     CALIBRATION,
     CLOUD,

@@ -16,8 +16,8 @@ from drivers.recording import disk_writer
 from drivers.recording.disk_writer import CHUNK_BYTES, FULL, PRUNED, RESERVE_BYTES, SLOW
 from drivers.recording.flights_folder import UNARMED, flights_in, flown_in, may_go
 from drivers.recording.mcap_writer import McapWriter
-from drivers.recording.recorded_flight import RecordedFlight, open_recording
 from drivers.recording.recorder import Recorder
+from drivers.recording.recording_as_flight import RecordedFlight, open_recording
 from tests.support.flights.recorded import SIZE, START_NS, STEP_NS, camera, record
 
 DISK_MB = 12

@@ -14,7 +14,7 @@ from companion.geometry.camera import Camera
 from companion.streaming.viewer import FileViewer
 from companion.telemetry import AirspeedSample, HeightSample, Telemetry
 from companion.timing.link_clock import ClockFilter
-from drivers.recording.recorded_content import sample_bytes, sample_of, sample_topic
+from drivers.recording.recording_codec import sample_bytes, sample_of, sample_topic
 from drivers.telemetry.live_samples import LiveSamples
 from drivers.telemetry.mavlink_samples import samples_of
 from drivers.telemetry.telemetry_csv import read_telemetry_csv, telemetry_csv

@@ -17,7 +17,7 @@ from companion.flight_notes import GateStep
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
 from companion.messages import Odometry, TrackState
 from companion.telemetry import AttitudeSample
-from drivers.recording.recorded_content import decision_bytes
+from drivers.recording.recording_codec import decision_bytes
 from tests.support.flights.recorded_steps import recorded
 
 MS = 1_000_000

@@ -11,7 +11,7 @@ from companion.messages import Bytes, Warned
 from companion.telemetry import Telemetry
 from drivers.recording.mcap_file import DAMAGED, ChunkPlace, McapMessage
 from drivers.recording.picture_codec import still
-from drivers.recording.recorded_content import is_sample_topic, sample_of
+from drivers.recording.recording_codec import is_sample_topic, sample_of
 from drivers.recording.recording_topics import GREY, HEALTH, PICTURES, PROFILE, VIDEO
 from drivers.recording.repair import n_cut_bytes, opened, was_cut
 from drivers.video.h264_encoder import is_intra
@@ -29,7 +29,7 @@ class PicturePlace(NamedTuple):
     intra: bool
 
 
-class Recording:
+class RecordingReader:
     """An open recording and its content; FlightError if invalid."""
 
     def __init__(self, path: Path) -> None:
@@ -132,9 +132,9 @@ class Recording:
         return self.found.chunks[number].after_loss or number - 1 in self._bad
 
 
-def with_pictures(path: Path) -> Recording:
+def with_pictures(path: Path) -> RecordingReader:
     """Open a recording; FlightError where it is invalid, or has no images."""
-    recording = Recording(path)
+    recording = RecordingReader(path)
     if not recording.pictures:
         recording.close()
         raise FlightError(f"{path}: there are no pictures in it")

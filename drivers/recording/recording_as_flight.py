@@ -20,7 +20,7 @@ from drivers.recording.flights_folder import RECORDING
 from drivers.recording.mcap_file import McapFile
 from drivers.recording.picture_codec import grey_of, still
 from drivers.recording.recorder import CAMERA_JSON
-from drivers.recording.recording import PicturePlace, Recording, with_pictures
+from drivers.recording.recording_reader import PicturePlace, RecordingReader, with_pictures
 from drivers.recording.recording_topics import PROFILE, VIDEO
 from drivers.recording.video_codec import VideoDecoder
 from drivers.telemetry.telemetry_log import TelemetryLog, rates_hz
@@ -32,7 +32,7 @@ LOST = "a picture could not be decoded"
 class RecordedPictures:
     """Images of a recording as a `FrameSource`; their numbers are those of the flight."""
 
-    def __init__(self, recording: Recording, camera: Camera) -> None:
+    def __init__(self, recording: RecordingReader, camera: Camera) -> None:
         self.path = recording.path
         self.width, self.height = camera.width, camera.height
         self.recording = recording
@@ -81,7 +81,7 @@ class RecordedPictures:
 class RecordedFlight(Flight):
     """A flight read from our own recording."""
 
-    def __init__(self, recording: Recording, camera: Camera, log: TelemetryLog) -> None:
+    def __init__(self, recording: RecordingReader, camera: Camera, log: TelemetryLog) -> None:
         places = recording.pictures
         super().__init__(
             recording.path, camera, RecordedPictures(recording, camera),
@@ -172,7 +172,7 @@ def warnings_of(health: dict[str, Any]) -> tuple[Warned, ...]:
 
 
 def _camera(
-    recording: Recording, config: CameraConfig, start_ns: int
+    recording: RecordingReader, config: CameraConfig, start_ns: int
 ) -> tuple[Camera, tuple[Warned, ...]]:
     try:
         return camera_of(recording.found.attachments[CAMERA_JSON]), ()
@@ -192,7 +192,7 @@ def _camera(
 
 
 def telemetry_of(
-    recording: Recording, config: TelemetryConfig, warnings: tuple[Warned, ...] = ()
+    recording: RecordingReader, config: TelemetryConfig, warnings: tuple[Warned, ...] = ()
 ) -> TelemetryLog:
     """Samples of a recording, with these warnings and its own; it must have images."""
     shift_ns = round(config.offset_s * 1e9)

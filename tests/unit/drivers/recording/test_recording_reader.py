@@ -14,7 +14,7 @@ from drivers.open_flight import open_flight
 from drivers.recording.mcap_file import McapFile
 from drivers.recording.mcap_scan import scan
 from drivers.recording.picture_codec import picture_encoder
-from drivers.recording.recorded_flight import RecordedFlight, is_recording, open_recording
+from drivers.recording.recording_as_flight import RecordedFlight, is_recording, open_recording
 from drivers.telemetry.tlog_records import TlogRecords
 from drivers.video import h264_encoder
 from tests.support.flights.recorded import SIZE, START_NS, STEP_NS, camera, frames, record, samples
