@@ -171,9 +171,15 @@ class HealthWatch:
         now_ns = self._clock.now_ns()
         frames_come = now_ns - self._last_frame_ns < GOVERN_NS
         is_wanted = self._flights.current is not None or self.flight_due
-        if not is_wanted or not frames_come:
+        if not is_wanted or not frames_come or self._starts:
             self._progress_ns = now_ns
         return now_ns - self._progress_ns < PATIENCE_NS
+
+    @property
+    def _starts(self) -> bool:
+        """True while localisation starts, and may take longer for that."""
+        flight = self._flights.current
+        return flight is not None and not flight.ready and flight.duration_s < START_S
 
     @property
     def pose_loop_alive(self) -> bool:
@@ -182,7 +188,7 @@ class HealthWatch:
         frames_come = now_ns - self._last_frame_ns < GOVERN_NS
         if flight is None or not flight.ready or not frames_come:
             self._odometry_ns = max(self._odometry_ns, now_ns - STUCK_NS // 2)
-            return flight is None or flight.ready or flight.duration_s < START_S
+            return flight is None or flight.ready or self._starts
         works = any(
             each.name == "localisation" and each.cpu_cores > BUSY_CORES
             for each in self.load.processes

@@ -60,6 +60,7 @@ shipped = ShippedCode(FOLDER, HERE)
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 WITHOUT_LOOPS = ("compiling", "ship", "shipped_code")
 """Modules of the package that define none."""
+COMPILES = "companion: loops are compiled for this processor, once: this takes a minute or two"
 may_copy = True
 """False where this process is to compile by itself."""
 _loops: dict[str, Any] = {}
@@ -134,6 +135,7 @@ def _compiled_by_a_copy() -> bool:
     """Have a copy of this process compile all loops into the cache, once; True where it has."""
     if not may_copy or len(os.listdir("/proc/self/task")) > 1:
         return False
+    print(COMPILES, file=sys.stderr, flush=True)
     pid = os.fork()
     if pid == 0:
         _compile_all()

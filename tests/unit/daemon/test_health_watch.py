@@ -85,6 +85,19 @@ def test_no_pose_for_long_is_no_progress_where_a_flight_is_due(
     assert seen[-1] is not is_due
 
 
+@pytest.mark.parametrize(("started_s", "seen"), [(60.0, True), (121.0, False)])
+def test_a_first_start_that_compiles_is_no_lack_of_progress(
+    started_s: float, seen: bool, tmp_path: Path
+) -> None:
+    flight = SimpleNamespace(ready=False, duration_s=started_s)
+    watch, clock = watch_of(flight, tmp_path), FlightClock()
+    watch._clock, watch._progress_ns = clock, 0
+    clock.now_ns = lambda: 2 * PATIENCE_NS  # type: ignore[method-assign,misc]
+    watch.frame_came(2 * PATIENCE_NS)
+    assert watch.progress is seen
+    assert watch.pose_loop_alive is seen
+
+
 def test_a_camera_that_is_late_by_itself_is_no_load(tmp_path: Path) -> None:
     """Of a network camera a picture may be 200 ms old when it comes."""
     stage = SimpleNamespace(n_dropped=0)
