@@ -18,4 +18,4 @@ def component_state(health: Health) -> int:
     died = any(stage.name == "localisation" and not stage.alive for stage in health.stages)
     if is_blind or died or health.tracker == "lost":
         return CRITICAL
-    return ACTIVE if health.tracker in ("tracking", "coasting") else CALIBRATING
+    return ACTIVE if health.tracker in ("tracking", "dead reckoning") else CALIBRATING

@@ -53,7 +53,7 @@ STUCK = "localisation hangs and is ended"
 IN_WORDS = {
     TrackState.INITIALISING: "initialising",
     TrackState.TRACKING: "tracking",
-    TrackState.DEAD_RECKONING: "coasting",
+    TrackState.DEAD_RECKONING: "dead reckoning",
     TrackState.LOST: "lost",
     TrackState.STANDING: "standing",
 }

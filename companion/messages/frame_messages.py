@@ -42,11 +42,16 @@ class TrackState(Enum):
 
     INITIALISING = "initialising"
     TRACKING = "tracking"
-    DEAD_RECKONING = "coasting"
+    DEAD_RECKONING = "dead reckoning"
     """No map points found; the pose is propagated by the autopilot's attitude and velocity."""
     LOST = "lost"
     STANDING = "standing"
     """Of an odometry only: the vehicle stands on the ground, at a fixed place."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> TrackState | None:
+        """Dead reckoning under its name in earlier recordings."""
+        return cls.DEAD_RECKONING if value == "coasting" else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,7 +28,7 @@ class Shown(Enum):
     WAITING = "Waiting"
     INITIALISING = "Initialising"
     TRACKING = "Tracking"
-    DEAD_RECKONING = "Coasting"
+    DEAD_RECKONING = "Dead reckoning"
     LOST = "Lost"
     STANDING = "Standing"
 

@@ -67,5 +67,5 @@ def test_the_flight_is_not_held_up_and_nothing_grows(trial: Trial) -> None:
 
 
 def test_the_viewer_says_what_it_sees(trial: Trial) -> None:
-    assert trial.facts["state"] in ("Tracking", "Coasting")
+    assert trial.facts["state"] in ("Tracking", "Dead reckoning")
     assert trial.facts["budget_kbit_s"] == BUDGET_KBIT_S

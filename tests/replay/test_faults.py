@@ -62,7 +62,7 @@ def test_two_seconds_of_white(tmp_path: Path) -> None:
     assert len(found.t_s) >= 0.85 * (len(FRAMES) - len(FAULTY))
     assert scored(found).ate_sim3_m <= 0.3
     states = run.report["states"]
-    assert states.get("coasting", 0) + states.get("lost", 0) >= len(FAULTY) - 2
+    assert states.get("dead reckoning", 0) + states.get("lost", 0) >= len(FAULTY) - 2
 
 
 def test_two_seconds_of_the_same_image(tmp_path: Path) -> None:

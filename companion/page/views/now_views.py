@@ -18,7 +18,7 @@ from companion.page.views.site import Site, is_number
 RECENT_S = 600.0
 """Age of warnings that are shown here; Health in the journal has all."""
 WORDS = {
-    "tracking": "Tracking", "standing": "Standing", "coasting": "Coasting",
+    "tracking": "Tracking", "standing": "Standing", "dead reckoning": "Dead reckoning",
     "initialising": "The map is being begun", "lost": "Lost", "starting": "Starting",
 }  # fmt: skip
 

@@ -65,7 +65,8 @@ PLOTTED = {
 SERIES = {
     "height": "m above home", "speed": "m/s", "quality": "% sure", "rate": "poses a second",
     "latency": "ms late", "link": "kbit/s", "cpu": "% busy", "scale": "m per unit of the map",
-    "points": "points found", "state": "3 tracking or standing, 2 coasting, 1 initialising, 0 lost",
+    "points": "points found",
+    "state": "3 tracking or standing, 2 dead reckoning, 1 initialising, 0 lost",
     **{name: kind.schema.curve for kind, name in CURVES.items()},
 }  # fmt: skip
 COLOUR_PATH = [255, 176, 32]

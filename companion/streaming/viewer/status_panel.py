@@ -9,7 +9,7 @@ MEANINGS = {
     "Standing": "On the ground: the place is fixed until it lifts off.",
     "Tracking": "The camera knows where it is.",
     "Initialising": "Move sideways, so that the camera sees depth.",
-    "Coasting": "Nothing is recognised; the place follows from attitude and speed.",
+    "Dead reckoning": "Nothing is recognised; the place follows from attitude and speed.",
     "Lost": "The camera does not know where it is. Go back to where it did.",
     "Waiting": "No pictures yet.",
 }

@@ -22,7 +22,7 @@ COLUMNS = (
     ("live", "live_ate_m"), ("RPE", "rpe_m"), ("scale", "scale_error"),
     ("heading", "heading_error_deg"), ("worst step", "worst_step_m"),
     ("NEES", "nees"), ("NEES yaw", "nees_yaw"), ("gap s", "longest_gap_s"),
-    ("coasted", "coasted"),
+    ("dead_reckoned", "dead reckoned"),
     ("resets", "resets"), ("segments", "segments"), ("loops", "loops"), ("keyframes", "keyframes"),
     ("ms", "frame_ms_median"), ("p95", "frame_ms_p95"), ("mapping", "mapping_ms_median"),
     ("growth", "cost_growth"), ("MB", "peak_memory_mb"),
@@ -54,7 +54,7 @@ class BenchRow:
     nees_yaw: float | None
     resets: int
     longest_gap_s: float
-    coasted: int
+    dead_reckoned: int
     keyframes: int
     segments: int
     loops: int

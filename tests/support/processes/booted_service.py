@@ -49,7 +49,9 @@ class BootedService:
             found.update(self.status())
             sources = [source["state"] == "running" for source in found.get("sources", ())]
             active = self.shown("ActiveState") == "active"
-            return active and all(sources) and found.get("tracker") in ("tracking", "coasting")
+            return (
+                active and all(sources) and found.get("tracker") in ("tracking", "dead reckoning")
+            )
 
         try:
             until(flies, "a running service that tracks", timeout_s)

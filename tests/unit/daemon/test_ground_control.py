@@ -231,7 +231,7 @@ def test_a_kept_file_that_no_ground_has_written_is_refused(tmp_path: Path, text:
         ("running", "f", "starting", True, CALIBRATING),
         ("running", "f", "initialising", True, CALIBRATING),
         ("running", "f", "tracking", True, ACTIVE),
-        ("running", "f", "coasting", True, ACTIVE),
+        ("running", "f", "dead reckoning", True, ACTIVE),
         ("running", "f", "lost", True, CRITICAL),
         ("running", "f", "tracking", False, CRITICAL),
         ("frozen", "f", "tracking", True, CRITICAL),

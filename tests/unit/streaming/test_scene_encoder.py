@@ -53,8 +53,8 @@ def lost(seq: int) -> Track:
 
 
 def test_each_state_of_the_tracker_has_its_word() -> None:
-    coasting = replace(flown.track(21), state=TrackState.DEAD_RECKONING, n_inliers=0)
-    items = told([flown.update(), flown.track(20), coasting, lost(22), lost(23)])
+    reckoned = replace(flown.track(21), state=TrackState.DEAD_RECKONING, n_inliers=0)
+    items = told([flown.update(), flown.track(20), reckoned, lost(22), lost(23)])
     poses = [item for item in items if isinstance(item, PoseItem)]
     states = [Shown.TRACKING, Shown.DEAD_RECKONING, Shown.LOST, Shown.LOST]
     assert [p.shown for p in poses] == states
@@ -62,7 +62,7 @@ def test_each_state_of_the_tracker_has_its_word() -> None:
     assert {state.value for state in TrackState} <= {shown.value.lower() for shown in Shown}
     said = [(item.text, item.is_warning) for item in items if isinstance(item, LogItem)]
     assert said == [
-        ("Tracker: tracking", False), ("Tracker: coasting", True), ("Tracker: lost", True)
+        ("Tracker: tracking", False), ("Tracker: dead reckoning", True), ("Tracker: lost", True)
     ]  # fmt: skip
 
 
