@@ -92,7 +92,7 @@ def test_a_first_start_that_compiles_is_no_lack_of_progress(
     flight = SimpleNamespace(ready=False, duration_s=started_s)
     watch, clock = watch_of(flight, tmp_path), FlightClock()
     watch._clock, watch._progress_ns = clock, 0
-    clock.now_ns = lambda: 2 * PATIENCE_NS  # type: ignore[method-assign,misc]
+    clock.now_ns = lambda: 2 * PATIENCE_NS  # type: ignore[method-assign]
     watch.frame_came(2 * PATIENCE_NS)
     assert watch.progress is seen
     assert watch.pose_loop_alive is seen
