@@ -24,7 +24,7 @@ demo: opencl
 test: $(VENV)/.installed-dev opencl
 	$(MAKE) --no-print-directory --jobs=2 lint computed
 	$(MAKE) --no-print-directory --jobs=2 flights light
-	$(BIN)/pytest tests/system tests/firmware $(ALONE) || $(ONCE_MORE)
+	$(BIN)/pytest tests/system tests/firmware $(ALONE) $(SLOWEST) || $(ONCE_MORE)
 
 computed: loops
 	$(BIN)/pytest -m "not real_time" --ignore tests/live --ignore tests/system -n 3 $(IN_ORDER)
@@ -45,7 +45,8 @@ SLOWEST = --durations 60 --durations-min 2
 ALONE = $(shell grep -l mark.alone tests/live/test_*.py)
 LIGHT = $(shell grep -rl --include='test_*.py' real_time tests/unit; grep -l mark.light tests/live/test_*.py)
 FLIGHTS = $(filter-out $(ALONE) $(LIGHT), $(shell ls tests/live/test_*.py; grep -rl real_time --include='test_*.py' tests/replay))
-ONCE_MORE = { [ $$? -eq 1 ] && $(BIN)/pytest -m real_time $(CACHE) $$($(FAILED_FILES)); }
+ONCE_MORE = { [ $$? -eq 1 ] && files=$$($(FAILED_FILES)) && echo "ONCE MORE, one after the other: $$files" && \
+  $(BIN)/pytest -m real_time $(CACHE) $$files; }
 FAILED_FILES = $(BIN)/python -c "import json; \
   failed = json.load(open('.pytest_cache/$(if $(CACHE),light/)v/cache/lastfailed')); \
   print(*sorted({name.partition('::')[0] for name in failed}))"

@@ -21,11 +21,10 @@ from tests.support.left_behind import left_since, running, watch_tasks
 from tests.support.processes.steal import FlownAgain
 
 LONGEST = (
-    "test_two_nodes", "test_flown_by_vision", "test_as_flown", "test_set_up_in_browser",
-    "test_stage_faults", "test_page_in_browser", "test_whole_flight",
-    "test_recording", "test_service", "test_dead_reckoning", "test_autopilot_faults",
-    "test_daemon_limits", "test_ground_control", "test_armed_settings", "test_restart_in_flight",
-    "test_device_faults", "test_power_on",
+    "test_two_nodes", "test_flown_by_vision", "test_as_flown", "test_stage_faults",
+    "test_page_in_browser", "test_whole_flight", "test_recording", "test_service",
+    "test_dead_reckoning", "test_autopilot_faults", "test_daemon_limits", "test_ground_control",
+    "test_armed_settings", "test_restart_in_flight", "test_device_faults", "test_power_on",
 )  # fmt: skip
 """Files in real time that take two minutes to half of one. They begin first, in this order, for
 workers of pytest-xdist to end together; of what only computes the whole replays begin first."""

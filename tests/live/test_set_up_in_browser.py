@@ -31,6 +31,7 @@ from tests.support.processes.paged import Paged
 from tests.support.waiting import until
 
 pytestmark = [
+    pytest.mark.alone,  # flight, browser and search of the mount fill two cores
     pytest.mark.continues,
     pytest.mark.skipif(not CHROMIUM.exists(), reason="there is no Chromium: apt install chromium"),
 ]
