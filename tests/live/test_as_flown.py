@@ -16,7 +16,7 @@ from drivers.recording.recording_as_flight import open_recording
 from tests.support.flights.halting import Halting
 from tests.support.processes.as_flown import ENOUGH, again
 from tests.support.processes.flying import Flying
-from tests.support.processes.program import replay
+from tests.support.processes.program import replay_here
 
 KEPT_S = 2.5
 """So long after the first pose the map is kept with its scale."""
@@ -48,7 +48,7 @@ def test_a_flight_in_the_map_of_an_earlier_one_is_flown_again_in_that_map(tmp_pa
     moved, other = site_map.rename(tmp_path / "moved.map"), path / "site.map"
     assert other.exists()
     for options in ((), ("--map", str(other))):
-        refused = replay(path, tmp_path / "refused", "--as-flown", *options)
+        refused = replay_here(path, tmp_path / "refused", "--as-flown", *options)
         assert refused.status and "--map FILE names it" in refused.stderr
     _, found = again(path, tmp_path / "again", "--map", str(moved))
     assert found["frames_same"] == found["frames"] > 50

@@ -27,7 +27,7 @@ def test_in_flight_the_next_device_takes_over_and_the_pose_goes_on(
     now = tmp_path / "now"
     fail(monkeypatch, tmp_path, "abort", first, when=now)
     with Flying(
-        tmp_path, "depth.enabled=true", "expert.depth.stride=4", program=UNGOVERNED
+        tmp_path, "depth.enabled=true", "expert.depth.stride=8", program=UNGOVERNED
     ) as flying:
         flying.until_source("camera", "running")
         flying.until_source("autopilot", "running")

@@ -29,8 +29,9 @@ def viewer_url() -> Iterator[str]:
 def flying(tmp_path_factory: pytest.TempPathFactory, viewer_url: str) -> Iterator[Flying]:
     folder = tmp_path_factory.mktemp("stages")
     with Flying(
-        folder, "depth.enabled=true", f"daemon.viewer={viewer_url}", "video.listen=127.0.0.1:0",
-        "landing.marker=apriltag_36h11", "landing.id=0", "landing.size_m=2",
+        folder, "depth.enabled=true", "expert.depth.stride=8", f"daemon.viewer={viewer_url}",
+        "video.listen=127.0.0.1:0", "landing.marker=apriltag_36h11", "landing.id=0",
+        "landing.size_m=2",
     ) as begun:  # fmt: skip
         begun.until_source("camera", "running")
         begun.until_source("autopilot", "running")

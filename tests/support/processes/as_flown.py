@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tests.support.processes.program import Run, replay
+from tests.support.processes.program import Run, replay_here
 
 ENOUGH = 150
 """Messages with poses, however long they take on a busy machine."""
@@ -14,7 +14,7 @@ ENOUGH = 150
 
 def again(path: Path, out: Path, *options: str) -> tuple[Run, dict[str, Any]]:
     """The replay of a flight's folder, and its verdict: as_flown.json."""
-    done = replay(path, out, "--as-flown", *options)
+    done = replay_here(path, out, "--as-flown", *options)
     assert done.status == 0, done.stdout + done.stderr
     found: dict[str, Any] = json.loads((out / "as_flown.json").read_text())
     for gate in found["by_gate"].values():
