@@ -52,7 +52,8 @@ from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.site_map import SiteMap
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping.far_keyframes import ArrayFile
-from companion.slam.tracking.tracker import Prior, Tracker
+from companion.slam.tracking.prior import Prior
+from companion.slam.tracking.tracker import Tracker
 from companion.telemetry import Telemetry
 from companion.timing.clock import Timer
 

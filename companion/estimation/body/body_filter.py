@@ -5,6 +5,15 @@ velocity, the accelerometers' bias, the tilt and its drift are linear, and a Kal
 has no point of linearisation to be wrong about (the same model finds the scale, see
 `inertial_scale`).
 Where no accelerations are to be had, or to be believed, the velocity is held.
+
+| state (`body_state`) | size, unit, axes | goes on by |
+|---|---|---|
+| `PLACE`, `VELOCITY` | 3, m; 3, m/s; of the map | accelerations; white noise of these |
+| `BIAS` of the accelerometers | 3, m/s2; body | a random walk |
+| `TILT` of the given level | 2, m/s2; horizontal, as gravity's part | `DRIFT`; it decays |
+| `DRIFT` of the tilt | 2, m/s3; horizontal | it decays |
+| `GROUND`, `BAROMETER` | down, m: ground below, barometer's zero | relief, weather |
+| `SCALE` of the map | logarithm, its mean 0 | constant |
 """
 
 from __future__ import annotations

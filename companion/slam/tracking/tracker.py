@@ -7,13 +7,13 @@ Knows no clock: times come with the frames, durations are measured by the given 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from companion.config import Config
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, Pose, angle_between
+from companion.geometry.transforms import Pose
 from companion.messages import (
     Bytes,
     Frame,
@@ -41,11 +41,11 @@ from companion.slam.mapping.mapping_worker import (
 )
 from companion.slam.tracking.frame_tracker import FrameTracker
 from companion.slam.tracking.map_start import backfill, continue_map, initialise_map
+from companion.slam.tracking.prior import Prior
 from companion.slam.tracking.refined_frames import RefinedFrames
 from companion.slam.tracking.tracked_keyframes import TrackedKeyframes
 from companion.timing.clock import Timer
 
-MAX_ROTATION_ERROR_RAD = np.radians(15.0)
 ATTITUDE_RESTART_RATIO = 0.4
 """With attitude, initialisation is more certain: another map may start this much sooner."""
 MIN_PREDICTED_INLIERS, MIN_PREDICTED_RATIO = 25, 0.2
@@ -57,20 +57,6 @@ BACKFILLED_IN_FLIGHT = 25
 """Earlier frames that are tracked where a map begins: two to four milliseconds each, for which the
 frame of now waits. The pose gate bridges 200 ms; all 150 of the buffer took 250 to 400."""
 TrackerOutput = Track | KeyframeAdded | LoopClosed
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Prior:
-    """Prediction for a frame, before its image is processed.
-
-    `map_from_camera` predicted pose or None; `ned_from_camera` rotation by the autopilot or None,
-    and `map_from_camera_rotation` the same in the axes of the map, which may be some degrees off
-    level.
-    """
-
-    map_from_camera: Pose | None
-    ned_from_camera: Array | None
-    map_from_camera_rotation: Array | None = None
 
 
 class Tracker:
@@ -90,9 +76,9 @@ class Tracker:
         self.extractor = FeatureExtractor(config.features, camera)
         self._ahead = FeaturesAhead(config.features, camera, self.extractor)
         self.n_features = 0
-        """Features seen in the last frame,"""
+        """Features seen in the last frame."""
         self.nearly_drowned = False
-        """which may be of noise."""
+        """True where these may be of noise."""
         self._drowned = False
         self._is_live = background
         self.map_lock = MapLock(order)
@@ -125,7 +111,7 @@ class Tracker:
         """Clear the state of the last frame after another map became active."""
         self._last: View | None = None
         self._last_tracked: View | None = None
-        """The last frame tracked before loss, where no relative rotation is measured"""
+        """The last frame tracked before loss, where no relative rotation is measured."""
         self.keyframes.reset()
         self._frame_tracker.reset()
 
@@ -220,7 +206,7 @@ class Tracker:
         if not self._worker.busy and keyframes.needed(view):
             keyframes.insert(view)
         assert keyframes.reference is not None
-        return [self._told(view, keyframes.reference)]
+        return [self._tracked(view, keyframes.reference)]
 
     # -- initialising ---------------------------------------------------------------------------
 
@@ -270,9 +256,9 @@ class Tracker:
             self._frame_tracker, self._bootstrap.pending, first, second, reference,
             BACKFILLED_IN_FLIGHT if self._is_live else None,
         )  # fmt: skip
-        return [self._told(view, reference, backfilled=True) for view in views]
+        return [self._tracked(view, reference, backfilled=True) for view in views]
 
-    def _told(self, view: View, reference: Keyframe, backfilled: bool = False) -> Track:
+    def _tracked(self, view: View, reference: Keyframe, backfilled: bool = False) -> Track:
         self._refined.add(self.map, view, reference)
         return track_of(self.map, view, reference, backfilled)
 
@@ -316,7 +302,7 @@ class Tracker:
         ):
             return False
         frame_tracker.refine(view)
-        return _rotation_plausible(view, prior)
+        return prior.agrees(view.camera_from_map)
 
     def _relocalise_by_reference(self, view: View) -> bool:
         reference = self.keyframes.reference
@@ -360,11 +346,3 @@ class Tracker:
             self._bootstrap = Bootstrap(self._camera, start)
         self.state = TrackState.LOST
         return self._initialise(frame, features, prior)
-
-
-def _rotation_plausible(view: View, prior: Prior) -> bool:
-    """True if the rotation of a pose agrees with the prediction by attitude, or there is none."""
-    if prior.map_from_camera is None or prior.ned_from_camera is None:
-        return True
-    off_rad = angle_between(prior.map_from_camera.rotation, view.camera_from_map.rotation.T)
-    return off_rad < float(MAX_ROTATION_ERROR_RAD)

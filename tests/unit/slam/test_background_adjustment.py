@@ -28,7 +28,8 @@ from companion.slam.mapping.map_adjustment import (
 from companion.slam.mapping.mapper import Mapper
 from companion.slam.mapping.mapping_worker import BackgroundMapping, Done, MapLock
 from companion.slam.optimisation.bundle_adjustment import AdjustmentResult, adjust
-from companion.slam.tracking.tracker import Prior, Tracker
+from companion.slam.tracking.prior import Prior
+from companion.slam.tracking.tracker import Tracker
 from tests.support.flights.scene import DOWN_LOOKING, PlaneWorld, aligned_error
 from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
 

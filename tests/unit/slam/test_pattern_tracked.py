@@ -8,7 +8,8 @@ import numpy as np
 
 from companion.config import CameraConfig, Config
 from companion.messages import Frame, Track
-from companion.slam.tracking.tracker import Prior, Tracker
+from companion.slam.tracking.prior import Prior
+from companion.slam.tracking.tracker import Tracker
 from drivers.camera.pattern_camera import PatternScene, pattern_optics, world_from_camera
 from tests.support.flights.scene import aligned_error
 

@@ -15,7 +15,8 @@ from companion.geometry.transforms import Array, Pose, angle_between, rotation_f
 from companion.messages import Frame, KeyframeAdded, Track, TrackState
 from companion.slam.loop.relocalizer import Relocalised
 from companion.slam.map.sparse_map import SlamMap
-from companion.slam.tracking.tracker import Prior, Tracker
+from companion.slam.tracking.prior import Prior
+from companion.slam.tracking.tracker import Tracker
 from tests.support.flights.scene import DOWN_LOOKING, PlaneWorld, aligned_error
 
 CAMERA = Camera(
