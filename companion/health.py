@@ -59,6 +59,7 @@ class FeedbackHealth:
 
     `why_not` is one of a few constant phrases, by which a change is detected; numbers belong in
     `detail`. Latency is from exposure to sending. With `bridging` poses go by dead reckoning.
+    `n_overtaken` measured poses were not sent, as predicted ones for their time had been.
     """
 
     mode: str = "off"
@@ -71,6 +72,7 @@ class FeedbackHealth:
     n_sent: int = 0
     n_resets: int = 0
     bridging: bool = False
+    n_overtaken: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -129,7 +129,8 @@ def _feedback(feedback: Mapping[str, Any]) -> str:
         f"{feedback['mode']}{by}, {_number(feedback.get('rate_hz'), '/s')},"
         f" {_after_exposure(feedback)}"
         f" ({_number(feedback.get('latency_p95_ms'), ' ms')} p95),"
-        f" {feedback.get('n_resets', 0)} resets"
+        f" {feedback.get('n_resets', 0)} resets,"
+        f" {feedback.get('n_overtaken', 0)} overtaken by predictions"
     )
 
 

@@ -180,6 +180,7 @@ class PoseSender(Sender):
             latency_p95_ms=p95_ms,
             n_sent=self._n_sent,
             n_resets=self._gate.n_resets,
+            n_overtaken=self._gate.n_overtaken,
         )
 
     def _send(self, pose: PoseToSend | None) -> None:

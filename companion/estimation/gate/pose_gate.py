@@ -94,6 +94,9 @@ class PoseGate:
         """Poses of accelerometers alone since the last other one."""
         self._periods_ns: deque[int] = deque(maxlen=N_PERIODS)
         self._last_rejection = ""
+        self.n_overtaken = 0
+        """Measured poses that came when a predicted one with a later stamp, or hardly an earlier
+        one, had been sent."""
         self.state = Sending.OFF
         self.why_not = NOT_YET
 
@@ -176,7 +179,9 @@ class PoseGate:
             if self.why_not:
                 return None
         self.state = Sending.BRIDGING if odometry.inertial else Sending.SENDING
-        return self._stamped(self._pose_of(odometry))
+        pose = self._stamped(self._pose_of(odometry))
+        self.n_overtaken += pose is None
+        return pose
 
     def due(self, now_ns: int) -> PoseToSend | None:
         """A predicted pose, where the camera is slower than the output rate, or a frame is late.
@@ -301,7 +306,7 @@ class PoseGate:
         return self._pose_of(accepted).ahead(ahead_ns, before, now, grown)
 
     def _stamped(self, pose: PoseToSend) -> PoseToSend | None:
-        """The same, if its stamp is later than the last sent."""
+        """The same, if its stamp is later than the last sent by `MIN_SPACING_NS`; else None."""
         if pose.t_ns < self._last_stamp_ns + MIN_SPACING_NS:
             return None
         self._last_stamp_ns = pose.t_ns

@@ -168,6 +168,16 @@ def test_old_and_repeated_stamps_are_not_sent() -> None:
     assert flight.gate.take(late, flight.now_ns + 400 * MS) is None
 
 
+def test_a_measured_pose_that_a_prediction_overtook_is_counted() -> None:
+    flight = Flight()
+    flight.run(2)
+    assert flight.gate.n_overtaken == 0
+    sent = flight.run(0.1, frames=False)
+    newest = odometry(sent[-1].t_ns - MS)
+    assert flight.gate.take(newest, flight.now_ns) is None
+    assert flight.gate.sending and flight.gate.n_overtaken == 1
+
+
 def test_discontinuities_are_counted_across_restarts() -> None:
     flight = Flight()
     flight.run(2)
