@@ -26,8 +26,9 @@ from companion.products.site_map_file import (
 )
 from companion.products.site_map_rows import SiteHead
 from companion.products.trajectory_file import trajectory_tum
+from companion.slam.loop.loop_closure import MIN_SHARED
 from companion.slam.map.site_map import SiteMap
-from companion.slam.mapping.site_merge import merge_sites
+from companion.slam.mapping.site_merge import merge_sites, shared_points
 from companion.slam.mapping.site_prune import prune_site
 
 BYTES_PER_MB = 1e6
@@ -111,7 +112,7 @@ def prune(path: Path, out: Path, spacing_deg: float) -> str:
 def merge(paths: Sequence[Path], out: Path) -> list[str]:
     """Merge maps, in this order, into a new file; a line about each that was added.
 
-    InputError where one shows no place that is seen in those before it.
+    InputError where one shows no place that is seen in those before it, or too little of one.
     """
     merged = read_site_map(map_path(paths[0])).site
     lines = []
@@ -120,10 +121,20 @@ def merge(paths: Sequence[Path], out: Path) -> list[str]:
         if (other.scale_factor, other.n_levels) != (merged.scale_factor, merged.n_levels):
             raise InputError(f"{path}: it was made with other features.scale_factor or n_levels")
         apart = world_from_site(other.georeference.origin, merged.georeference.origin)
-        both = merge_sites(merged, other, apart)
+        try:
+            both = merge_sites(merged, other, apart)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
         if both is None:
             raise InputError(f"{path}: no place in it is seen in {', '.join(map(str, paths[:1]))}")
-        lines.append(f"{path}: {_moved(merged, other, both, apart)}")
+        n = len(merged.keyframes)
+        n_shared = len(shared_points(both.keyframes[:n], both.keyframes[n:]))
+        bound = (
+            f"bound by {n_shared} points that both see"
+            if n_shared >= MIN_SHARED
+            else f"joined at one place only, with {n_shared} points that both see"
+        )
+        lines.append(f"{path}: {bound}; {_moved(merged, other, both, apart)}")
         merged = both
     write_site_map(out, merged)
     return lines

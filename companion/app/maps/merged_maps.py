@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from companion.errors import InputError
 from companion.estimation.site.site_use import world_from_site
 from companion.products.report.batch_page import MergedFlight, MergedMap
 from companion.products.site_map_file import SITE_MAP, read_site_map, write_site_map
@@ -26,9 +27,12 @@ MergePairs = Callable[[Sequence[Pair]], Iterator[bool]]
 
 
 def merge_pair(first: Path, other: Path, out: Path) -> bool:
-    """One Dask task: write two maps as one; False where no place of one is seen in the other."""
+    """One Dask task: write two maps as one; False where too little of one is seen in the other."""
     a, b = (read_site_map(path).site for path in (first, other))
-    both = merge_sites(a, b, world_from_site(b.georeference.origin, a.georeference.origin))
+    try:
+        both = merge_sites(a, b, world_from_site(b.georeference.origin, a.georeference.origin))
+    except InputError:
+        return False
     if both is not None:
         write_site_map(out, both)
     return both is not None

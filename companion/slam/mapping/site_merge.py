@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from companion.errors import InputError
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, Similarity, nearest_rotation
-from companion.slam.loop.loop_closure import LoopClosure, LoopDetector
+from companion.slam.features.orb_features import Ints
+from companion.slam.loop.loop_closure import MIN_SHARED, LoopClosure, LoopDetector
 from companion.slam.loop.map_merge import merge_maps
 from companion.slam.loop.place_recognition import KeyframeDatabase
 from companion.slam.loop.relocalizer import Relocalizer
+from companion.slam.map.site_flights import ROBUST
 from companion.slam.map.site_map import (
     SiteGeoreference,
     SiteMap,
     site_map_of,
     slam_map_of,
 )
-from companion.slam.map.sparse_map import SlamMap
+from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping.mapper import Mapper
 from companion.slam.mapping.mapping_worker import MapLock
 from companion.slam.mapping.site_fusion import fuse_sites
@@ -35,6 +39,8 @@ def merge_sites(first: SiteMap, other: SiteMap, other_in_first: Similarity) -> S
 
     `other_in_first` takes the second's world to the first's, as their origins have it. Both maps
     are adjusted as one, which then is placed as the two were, each weighted by its variance.
+    InputError where they are bound by one place alone, and that places the other's far end worse
+    than the place of both is stated.
     """
     camera = first.parts[0].camera
     here, there = slam_map_of(first, camera), slam_map_of(_numbered(other, first), camera)
@@ -45,6 +51,7 @@ def merge_sites(first: SiteMap, other: SiteMap, other_in_first: Similarity) -> S
     before = [
         _before(first, 0, Similarity.identity()), _before(other, _n_ids(first), other_in_first)
     ]  # fmt: skip
+    by_place_m = _sigma_by_place_m(here, found)
     merge_maps(here, there, found.here_from_there)
     mapper = Mapper(camera, here, MapLock())
     for _ in range(BINDING_ROUNDS):
@@ -52,18 +59,51 @@ def merge_sites(first: SiteMap, other: SiteMap, other_in_first: Similarity) -> S
         mapper.adjust_all(ITERATIONS)
     here.held = frozenset()
     mapper.adjust_all(ITERATIONS)
+    georeference = _both(first.georeference, other.georeference)
+    theirs = [k for key, k in here.keyframes.items() if key >= _n_ids(first)]
+    ours = [k for key, k in here.keyframes.items() if key < _n_ids(first)]
+    if len(shared_points(ours, theirs)) < MIN_SHARED and by_place_m > georeference.sigma_m:
+        raise InputError(
+            f"the maps meet at one place only, which places the farthest keyframe to "
+            f"{by_place_m:.2f} m, and both as one would state {georeference.sigma_m:.2f} m"
+        )
     n_first = len(first.parts)
     part_of_id = dict(zip(_ids(first), first.part_of.tolist(), strict=True)) | {
         key + _n_ids(first): n_first + part
         for key, part in zip(_ids(other), other.part_of.tolist(), strict=True)
     }
-    georeference = _both(first.georeference, other.georeference)
     revision = max(first.revision, other.revision) + 1
     newer = tuple(replace(part, revision=revision) for part in other.parts)
     return site_map_of(
         here, _placed(here, before), (*first.parts, *newer), part_of_id, georeference,
         revision,
     )  # fmt: skip
+
+
+def shared_points(ours: Sequence[Keyframe], theirs: Sequence[Keyframe]) -> Ints:
+    """Points that keyframes of both observe: below `MIN_SHARED` no patches bind the two."""
+    seen, seen_there = (np.concatenate([k.point_ids for k in each]) for each in (ours, theirs))
+    both = np.intersect1d(seen, seen_there)
+    return np.asarray(both[both >= 0])
+
+
+def _sigma_by_place_m(here: SlamMap, found: LoopClosure) -> float:
+    """Standard deviation of the other map's farthest keyframe, of one axis, by one place alone.
+
+    That of a similarity fitted to the points seen there from both maps: they disagree by some
+    sigma, and the lever from them to the keyframe turns about the axis that they fix least.
+    """
+    own = found.keyframe.point_ids[found.relocalised.features]
+    both = (own >= 0) & here.alive[np.maximum(own, 0)]
+    ours_m = here.positions[own[both]]
+    theirs_m = found.here_from_there.apply(found.there.positions[found.relocalised.points[both]])
+    sigma_m = ROBUST * float(np.median(np.abs(ours_m - theirs_m)))
+    centre = ours_m.mean(0)
+    spread = np.linalg.eigvalsh(np.cov(ours_m.T, bias=True))
+    there = found.there.keyframes.values()
+    ends = found.here_from_there.apply(np.stack([k.centre for k in there]))
+    lever_m = float(np.linalg.norm(ends - centre, axis=1).max())
+    return sigma_m * float(np.sqrt((1.0 + lever_m**2 / (spread[0] + spread[1])) / len(ours_m)))
 
 
 def _ids(site: SiteMap) -> list[int]:

@@ -120,6 +120,28 @@ def test_maps_of_two_sites_are_not_merged(sites: tuple[SiteMap, SiteMap]) -> Non
     assert merge_sites(sites[0], elsewhere, IN_ITSELF) is None
 
 
+def without_patches(site: SiteMap, sigma_m: float) -> SiteMap:
+    level = np.full_like(site.points.patch_level, -1)
+    return replace(
+        site, points=site.points._replace(patch_level=level),
+        georeference=replace(site.georeference, sigma_m=sigma_m),
+    )  # fmt: skip
+
+
+def test_maps_bound_by_one_place_alone_are_told_and_refused(
+    sites: tuple[SiteMap, SiteMap], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for sigma_m, status, said in ((5.0, 0, "at one place only"), (1e-4, 2, "at one place only")):
+        for n, site in enumerate(sites):
+            write_site_map(tmp_path / f"{n}.map", without_patches(site, sigma_m))
+        out = tmp_path / "both.map"
+        out.unlink(missing_ok=True)
+        given = [str(tmp_path / f"{n}.map") for n in range(2)]
+        assert main(["map", "merge", *given, "--out", str(out)]) == status
+        assert said in "".join(capsys.readouterr())
+        assert out.exists() == (status == 0)
+
+
 def test_pruning_leaves_out_redundant_keyframes_only(tmp_path: Path) -> None:
     ground = Ground(np.random.default_rng(8))
     near = [flown(np.array([0.02 * n, 0.0])) for n in range(16)]
