@@ -21,6 +21,8 @@ MIN_SCALE_OFF, SIGMAS_OFF = 0.1, 4.0
 """Relative difference of scales that contradict, at least, and in standard deviations."""
 MAX_FOCAL_OFF = 0.01
 """Relative difference of focal lengths of the same camera, calibrated twice."""
+N_LOOKED_AT = 50
+"""Keyframes of which the errors of features are looked at: tens of thousands of these."""
 TIMES_OFF = 3
 """Comparisons in a row that contradict the map before it counts: a filter may leap once."""
 LOCATED = "located in the map of an earlier flight"
@@ -182,6 +184,30 @@ def _is_other(theirs: Camera, ours: Camera) -> bool:
     return (theirs.width, theirs.height, theirs.distortion) != (
         ours.width, ours.height, ours.distortion,
     ) or abs(float(np.log(theirs.focal_px / ours.focal_px))) > MAX_FOCAL_OFF  # fmt: skip
+
+
+def wrong_metres(site: SiteMap, camera: Camera) -> str:
+    """Reason why places in a map would be wrong by a focal length that is a guess; "" if none.
+
+    A calibrated camera of any lens measures directions as the map has them. A guess that is off
+    from the focal length of the map moves what it sees at a distance from the centre of the picture
+    by that part of the distance, and its heights by as much: it is harmless as long as that is
+    below the standard deviation of a feature of the map.
+    """
+    theirs = site.parts[-1].camera
+    off = abs(float(np.log(theirs.focal_px / camera.focal_px)))
+    some = site.keyframes[:: 1 + len(site.keyframes) // N_LOOKED_AT]
+    sigmas = np.concatenate([1.0 / k.whitening[:, 0, 0] for k in some])
+    away = np.concatenate([np.linalg.norm(k.normalised, axis=1) for k in some])
+    allowed = float(np.median(sigmas) / np.sqrt(np.mean(away**2)))
+    if not (theirs.assumed or camera.assumed) or off <= allowed:
+        return ""
+    whose = "its camera's" if theirs.assumed else "the camera's"
+    return (
+        f"{whose} focal length is a guess, and {theirs.focal_px:.0f} pixels of the map differ from "
+        f"{camera.focal_px:.0f} of now by {100 * off:.1f} %, where its features allow "
+        f"{100 * allowed:.1f} %: calibrate"
+    )
 
 
 def _in_words(camera: Camera) -> str:

@@ -13,6 +13,7 @@ import pytest
 
 from companion.config import Config, MapConfig
 from companion.estimation.site.site_of_flight import site_of_flight
+from companion.estimation.site.site_use import wrong_metres
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Similarity
 from companion.messages import Frame, Georeference, Warned
@@ -68,7 +69,14 @@ def of_other_features(path: Path) -> None:
     write_site_map(path, replace(read_site_map(path).site, scale_factor=1.1, n_levels=12))
 
 
-@pytest.mark.parametrize("spoil", [cut, newer, letter, Path.unlink, of_other_features])
+def by_a_guess(path: Path) -> None:
+    """Made with a camera of which no focal length was known, and one tenth longer than now."""
+    site = read_site_map(path).site
+    camera = replace(CAMERA, fx=1.1 * CAMERA.fx, fy=1.1 * CAMERA.fy, assumed=True)
+    write_site_map(path, replace(site, parts=(replace(site.parts[0], camera=camera),)))
+
+
+@pytest.mark.parametrize("spoil", [cut, newer, letter, Path.unlink, of_other_features, by_a_guess])
 def test_a_flight_goes_on_without_it_and_a_replay_ends(
     path: Path, spoil: Callable[[Path], None]
 ) -> None:
@@ -79,6 +87,14 @@ def test_a_flight_goes_on_without_it_and_a_replay_ends(
     assert of_warning(warning.what) not in (None, OTHER())
     with pytest.raises(SiteMapError):
         said(path, False)
+
+
+def test_a_guess_that_pixels_do_not_tell_apart_does_no_harm(path: Path) -> None:
+    site = read_site_map(path).site
+    for ratio, refused in ((1.0005, False), (1.02, True)):
+        guess = replace(CAMERA, fx=ratio * CAMERA.fx, fy=ratio * CAMERA.fy, assumed=True)
+        assert bool(wrong_metres(site, guess)) is refused
+        assert not wrong_metres(site, replace(guess, assumed=False))
 
 
 def test_a_damaged_one_is_used_in_part(path: Path) -> None:
