@@ -152,14 +152,16 @@ class _Seeking:
 def _live(tail: RecordingTail) -> Iterator[Message]:
     """All that is recorded from now on, until nothing more comes."""
     never, came_s = threading.Event(), monotonic_s()
-    while monotonic_s() - came_s < SILENT_S:
+    while True:
         new = tail.read()
         frames = [each for each in new if isinstance(each, Frame)]
-        if frames:
-            came_s = monotonic_s()
+        if not frames and monotonic_s() - came_s > SILENT_S:
+            return
         # where this process gets too little time the newest second is enough: the map may be lost
         since_ns = frames[-1].t_ns - MOST_BEHIND_NS if frames else 0
         yield from (m for m in new if not isinstance(m, Frame) or m.t_ns > since_ns)
+        if frames:
+            came_s = monotonic_s()  # once they are taken, which may last longer than SILENT_S
         wait_s(never, LOOK_EVERY_S)
 
 
