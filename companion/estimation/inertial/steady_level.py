@@ -6,7 +6,8 @@ the rotations of the images.
 
 Samples from which the autopilot has taken the biases of its own EKF fit its own level alone: where
 it learns better, both change together, by as much as a tenth of a m/s2 and by as much of gravity.
-There the level is the autopilot's.
+There the level is the autopilot's, unless the images show a bias of roll and pitch in them that an
+EKF would have found: then they count as measured.
 """
 
 from __future__ import annotations
@@ -47,6 +48,9 @@ MAX_APART_RAD = float(np.radians(3.0))
 """From the autopilot's level: three standard deviations of one that goes by dead reckoning."""
 IMAGES_LAST_S = 15.0
 """Without images for longer, the bias is learnt from the autopilot's attitude, as before them."""
+AS_MEASURED_RAD_S, AS_MEASURED_SIGMAS = 2e-3, 5.0
+"""Bias of roll and pitch from which on marked samples count as measured. It turns the level by a
+degree in nine seconds, by which an EKF finds it."""
 BY_AUTOPILOT = -1
 WALK_M_S2, AUTOPILOT_WALK_M_S2 = 0.003, 0.03
 """Walk of the horizontal acceleration by a level, per root of a second: by gyroscopes, as their
@@ -68,7 +72,7 @@ class SteadyLevel:
         """Time and rates of the last sample."""
         self._rotation = np.eye(3)
         self._apart_rad = 0.0
-        self._is_autopilots = False
+        self._is_autopilots = self._shows_bias = False
         self._bias = np.zeros(3)
         self._covariance = np.diag(np.r_[np.zeros(3), np.full(3, SIGMA_BIAS_RAD_S**2)])
         """Of the rotation that is expected of the next image, and of the bias."""
@@ -88,6 +92,11 @@ class SteadyLevel:
         return self._apart_rad > MAX_APART_RAD
 
     @property
+    def _sigma_bias(self) -> float:
+        """Of the bias of roll and pitch, the larger."""
+        return float(np.sqrt(max(self._covariance[3, 3], self._covariance[4, 4])))
+
+    @property
     def _noise(self) -> float:
         return max(self._turns.density_rad_s, LEAST_DENSITY_RAD_S) ** 2
 
@@ -100,8 +109,7 @@ class SteadyLevel:
         """
         same_s = min(AUTOPILOT_S, SIGMA_AUTOPILOT_RAD**2 / self._noise)
         wanders = float(np.sqrt(self._noise / (2.0 * same_s)))
-        sigma_bias = float(np.sqrt(max(self._covariance[3, 3], self._covariance[4, 4])))
-        return (wanders + sigma_bias) / SIGMA_AUTOPILOT_RAD
+        return (wanders + self._sigma_bias) / SIGMA_AUTOPILOT_RAD
 
     @property
     def walk_m_s2(self) -> float:
@@ -136,12 +144,12 @@ class SteadyLevel:
         With `less_biases` the sample is less what the autopilot's EKF takes for biases.
         """
         last, self._last = self._last, (t_ns, rates)
-        self._is_autopilots = less_biases
+        self._is_autopilots = less_biases and not self._shows_bias
         if last is None:
             self._rotation, self._apart_rad = autopilot, 0.0
             return autopilot
         dt_s = regular_s((t_ns - last[0]) * 1e-9, self._turns.interval_s)
-        gain = 1.0 if less_biases else min(self.lead_hz * dt_s, 1.0)
+        gain = 1.0 if self._is_autopilots else min(self.lead_hz * dt_s, 1.0)
         self._rotation, self._apart_rad = led_level(
             self._rotation, autopilot, last[1], rates, self._bias, dt_s, gain
         )
@@ -153,6 +161,12 @@ class SteadyLevel:
         """Learn of the bias from the rotation (3, 3) of an image in its map."""
         self._images_ns = t_ns
         self._learn(t_ns, map_from_body, segment, SIGMA_IMAGES_RAD, IMAGES_S)
+        found = float(np.hypot(self._bias[0], self._bias[1]))
+        if self._shows_bias:  # half of it is enough, lest it come and go
+            self._shows_bias = found > 0.5 * AS_MEASURED_RAD_S
+        else:
+            least = max(AS_MEASURED_RAD_S, AS_MEASURED_SIGMAS * self._sigma_bias)
+            self._shows_bias = found > least
 
     def _learn(self, t_ns: int, seen: Array, source: int, sigma_rad: float, same_s: float) -> None:
         """Kalman filter of the rotation of a source, in its axes, and the bias."""

@@ -29,8 +29,9 @@ class Hover:
         return HEADING @ rotation_from_vector(np.array([0.05 * np.sin(t_s), 0.03, 0.0]))
 
     def fly(
-        self, seconds: float, seen: bool, drift_rad_s: float = 0.0, jump_rad: float = 0.0
-    ) -> float:
+        self, seconds: float, seen: bool, drift_rad_s: float = 0.0, jump_rad: float = 0.0,
+        less_biases: bool = False,
+    ) -> float:  # fmt: skip
         """Go on, with images or without; how far off its level is then, apart from the first's."""
         begin_ns, found = self.t_ns, self.true()
         for n in range(int(seconds * 100)):
@@ -42,7 +43,7 @@ class Hover:
             autopilot = rotation_from_vector(np.array([drifted, 0.0, 0.0])) @ self.true()
             sample = ImuSample(self.t_ns, rates, np.zeros(3))
             self.turns.take(sample)
-            found = self.level.of(self.t_ns, rates, autopilot)
+            found = self.level.of(self.t_ns, rates, autopilot, less_biases)
             if seen and n % 5 == 0:
                 self.level.see(self.t_ns, 1, self.true())
         off = vector_from_rotation(found @ self.true().T)
@@ -91,3 +92,28 @@ def test_two_levels_that_exclude_each_other_are_said() -> None:
     assert not hover.level.contradicted
     hover.fly(0.1, seen=False, jump_rad=np.radians(4.0))
     assert hover.level.contradicted
+
+
+def test_marked_samples_with_a_bias_that_an_ekf_would_have_found_are_as_measured() -> None:
+    hover = Hover(np.array([0.003, -0.002, 0.0]))
+    hover.fly(20.0, seen=True, less_biases=True)
+    off_rad = hover.fly(5.0, seen=False, drift_rad_s=np.radians(0.05), less_biases=True)
+    assert off_rad < np.radians(0.1)  # of 0.25
+
+
+@pytest.mark.parametrize("bias_rad_s", [[0.001, -0.0005, 0.0], [0.0, 0.0, 0.005]])
+def test_by_other_marked_samples_it_is_the_level_of_the_autopilot(bias_rad_s: list[float]) -> None:
+    """An EKF may leave so little of roll and pitch, and all of what is about the vertical."""
+    hover = Hover(np.array(bias_rad_s))
+    hover.fly(20.0, seen=True, less_biases=True)
+    off_rad = hover.fly(5.0, seen=False, drift_rad_s=np.radians(0.05), less_biases=True)
+    assert off_rad == pytest.approx(np.radians(0.25), rel=0.01)
+
+
+def test_a_bias_that_the_ekf_finds_late_is_not_taken_for_lasting() -> None:
+    hover = Hover(np.array([0.003, -0.002, 0.0]))
+    hover.fly(20.0, seen=True, less_biases=True)
+    hover.bias_rad_s = np.zeros(3)
+    hover.fly(60.0, seen=True, less_biases=True)
+    off_rad = hover.fly(5.0, seen=False, drift_rad_s=np.radians(0.05), less_biases=True)
+    assert off_rad == pytest.approx(np.radians(0.25), rel=0.01)
