@@ -18,6 +18,7 @@ from companion.estimation.georeference.depth_verdict import DepthVerdict
 from companion.estimation.georeference.height_scales import HeightScales
 from companion.estimation.georeference.measured_path import MeasuredPath
 from companion.estimation.georeference.trajectory_alignment import (
+    DISAGREE,
     SIGMA_TILT_RAD,
     SIGMA_VELOCITY_M_S,
     SIGMA_YAW_RAD,
@@ -28,7 +29,13 @@ from companion.estimation.georeference.trajectory_alignment import (
     fused,
     reconciled,
 )
-from companion.geometry.transforms import Array, Pose, Similarity, rotation_from_vector
+from companion.geometry.transforms import (
+    Array,
+    Pose,
+    Similarity,
+    angle_between,
+    rotation_from_vector,
+)
 from companion.messages import Georeference, Warned
 from companion.telemetry import PositionSample, PositionSource, Telemetry
 
@@ -120,6 +127,19 @@ class Georeferencer:
         if level is None:
             return None if depths is None else self._as_it_began(samples, depths)
         return self._from_scale(samples, level.world_from_map, prior)
+
+    def solve_carried(self, samples: list[AlignmentSample], carried: Level) -> Georeference | None:
+        """Georeference by positions of a map without attitude, its rotation `carried` to it.
+
+        None where positions contradict that rotation.
+        """
+        if mean_rotation(samples) is not None:
+            return None
+        placed = self._by_positions(samples, carried, None)
+        if placed is None or placed.sigma_yaw_rad > float(MAX_SIGMA_ROTATION_RAD):
+            return None
+        off_rad = angle_between(placed.world_from_map.rotation, carried.world_from_map)
+        return placed if off_rad < DISAGREE * carried.sigma_yaw_rad else None
 
     def _as_it_began(self, samples: list[AlignmentSample], depths: Scale) -> Georeference | None:
         """Georeference of a map whose attitude nobody measures: level as its first image is."""
@@ -287,3 +307,10 @@ def place_new_map(
     return Georeference(
         Similarity(scale, level, origin), sigma, float(SIGMA_YAW_RAD), method, len(samples), 0.0
     )
+
+
+def begun_at(own: Georeference, first_map: Array, start_ned_m: Array) -> Georeference:
+    """A georeference with the origin at which its first keyframe, at `first_map`, began."""
+    to_world = own.world_from_map
+    origin = start_ned_m - to_world.scale * to_world.rotation @ first_map
+    return replace(own, world_from_map=replace(to_world, translation=origin))

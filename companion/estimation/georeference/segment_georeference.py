@@ -10,9 +10,10 @@ import numpy as np
 
 from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.georeference.begun_segments import BegunSegments
+from companion.estimation.georeference.carried_rotation import carried_level
 from companion.estimation.georeference.depth_scales import DepthScales
 from companion.estimation.georeference.displacement_by_velocity import displacement_factor
-from companion.estimation.georeference.georeferencer import Georeferencer, place_new_map
+from companion.estimation.georeference.georeferencer import Georeferencer, begun_at, place_new_map
 from companion.estimation.georeference.inertial_scale import InertialScale, settled
 from companion.estimation.georeference.segment_samples import SegmentSamples
 from companion.estimation.georeference.tracked_places import TrackedPlaces
@@ -167,6 +168,8 @@ class SegmentGeoreferences:
                 if found is not None:
                     self._by_acceleration.note(t_ns, segment.first_keyframe_id, self._known, found)
                     self._known[segment.first_keyframe_id] = self._more_certain(segment, found)
+        if final:
+            self._place_by_carried_rotation(segments)
         main = self._main_of(segments, final)
         anchor = self.of(main)
         poses: list[PoseTable] = []
@@ -205,6 +208,17 @@ class SegmentGeoreferences:
             self._revision, t_ns, PoseTable.joined(poses), np.concatenate(points), anchor, scales,
             n_retired,
         )  # fmt: skip
+
+    def _place_by_carried_rotation(self, segments: Sequence[SlamMap]) -> None:
+        placed = [(s, g.world_from_map) for s in segments if (g := self.of(s)) and g.has_origin]
+        for segment in segments:
+            carried = None if self.of(segment) else carried_level(segment, placed)
+            if carried is None:
+                continue
+            samples = self._samples.of(segment, segment.spread_keyframes(MAX_SAMPLES_FINAL))
+            found = self._georeferencer.solve_carried(samples, carried)
+            if found is not None:
+                self._known[segment.first_keyframe_id] = found
 
     def _inertial_scale(self, segment: SlamMap, t_ns: int, final: bool) -> Scale | None:
         """Scale of a segment by accelerometers; None while it is unknown."""
@@ -286,7 +300,7 @@ class SegmentGeoreferences:
                 return None
             (lever_m,) = self._georeferencer.levers_of(self._samples.of(segment, [first]))
             start_ned_m = body.place_world_m + lever_m
-            return _beginning_at(own, first, start_ned_m)
+            return begun_at(own, first.centre, start_ned_m)
         before = [
             (k.t_ns, placed.world_from_map.apply(k.centre))
             for s in segments
@@ -306,7 +320,7 @@ class SegmentGeoreferences:
             samples = self._samples.of(segment, list(segment.keyframes.values()))
             travelled = self._georeferencer.travelled(samples)
             return None if travelled is None else place_new_map(samples, start_ned_m, *travelled)
-        return _beginning_at(own, first, start_ned_m)
+        return begun_at(own, first.centre, start_ned_m)
 
     def loop_allowed(
         self, segment: SlamMap, keyframe: Keyframe, other: Keyframe, found: LoopClosure
@@ -328,13 +342,6 @@ class SegmentGeoreferences:
         return off_m < MAX_LOOP_ERROR_M + 3.0 * placed.sigma_scale * float(
             np.linalg.norm(displacement_m)
         )
-
-
-def _beginning_at(own: Georeference, first: Keyframe, start_ned_m: Array) -> Georeference:
-    """A georeference with the origin at which its first keyframe is where that began."""
-    to_world = own.world_from_map
-    origin = start_ned_m - to_world.scale * to_world.rotation @ first.centre
-    return replace(own, world_from_map=replace(to_world, translation=origin))
 
 
 def _due(segment: SlamMap) -> bool:

@@ -52,10 +52,14 @@ class Scale(NamedTuple):
 
 
 class Level(NamedTuple):
-    """A rotation `world_from_map` (3, 3), and the standard deviation of its tilt to each side."""
+    """A rotation `world_from_map` (3, 3), and standard deviations.
+
+    Those are of its tilt, to each side, and of its heading.
+    """
 
     world_from_map: Array
     sigma_tilt_rad: float
+    sigma_yaw_rad: float = float(SIGMA_YAW_RAD)
 
 
 def apart(first: Scale, second: Scale) -> float:
@@ -218,7 +222,7 @@ def _add_level(equations: _Equations, estimate: Similarity, level: Level | None)
     weight = np.full(3, 1e-6)
     if level is not None:
         tilt_rad = level.sigma_tilt_rad
-        weight = np.array([tilt_rad, tilt_rad, float(SIGMA_YAW_RAD)]) ** -2
+        weight = np.array([tilt_rad, tilt_rad, level.sigma_yaw_rad]) ** -2
         error_rad = vector_from_rotation(estimate.rotation @ level.world_from_map.T)
         equations.gradient[1:4] -= weight * error_rad
     equations.information[1:4, 1:4] += np.diag(weight)
