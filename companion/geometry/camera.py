@@ -71,6 +71,11 @@ class Camera:
         """Size, focal lengths and centre by name, as documents have them."""
         return {name: getattr(self, name) for name in LENS}
 
+    def sees_as(self, other: Camera) -> bool:
+        """True if directions have the same pixels in both."""
+        model = (self.distortion, self.coefficients) == (other.distortion, other.coefficients)
+        return model and self.lens == other.lens
+
     @property
     def focal_px(self) -> float:
         """Mean focal length in pixels."""

@@ -140,6 +140,7 @@ def slam_map_of(site: SiteMap, camera: Camera) -> SlamMap:
     # a corner is seen at the pyramid level that fits its distance and the focal length
     longer = camera.focal_px / site.parts[-1].camera.focal_px
     points = site.points._replace(base_distance=site.points.base_distance * longer)
+    is_same = [part.camera.sees_as(camera) for part in site.parts]
     # attitudes of another flight had another mount and heading: what is known now corrects none
     earlier = tuple(
         replace(
@@ -147,9 +148,10 @@ def slam_map_of(site: SiteMap, camera: Camera) -> SlamMap:
             normalised=k.normalised if k.is_far else k.normalised.copy(),
             whitening=k.whitening if k.is_far else k.whitening.copy(),
             refined_for=k.refined_for if k.is_far else k.refined_for.copy(),
-            features=_seen_by(camera, k),
+            # of a file's, pixels are derived from directions
+            features=k.features if k.is_far and is_same[part] else _seen_by(camera, k),
         )
-        for k in site.keyframes
+        for k, part in zip(site.keyframes, site.part_of.tolist(), strict=True)
     )  # fmt: skip
     first = earlier[0].keyframe_id if earlier else NO_KEYFRAME
     whole = MapPart(first, True, earlier, points, site.is_in_file)
@@ -185,7 +187,9 @@ def _is_earlier(keyframe: Keyframe) -> bool:
 
 def pixels_of(camera: Camera, normalised: Array) -> Floats:
     """Pixels (N, 2) of directions; of those far out of the image some place beside it."""
-    seen = camera.project(np.c_[normalised, np.ones(len(normalised))])
+    directions = np.ones((len(normalised), 3))
+    directions[:, :2] = normalised
+    seen = camera.project(directions)
     size = np.array([camera.width, camera.height])
     return np.asarray(np.clip(seen, -BESIDE_PX, size + BESIDE_PX), np.float32)
 

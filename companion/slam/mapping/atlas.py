@@ -116,8 +116,7 @@ class Atlas:
     def use_site(self, site: SlamMap) -> None:
         """Look for the active map in that of an earlier flight, until it is found there."""
         database = KeyframeDatabase()
-        for keyframe in site.keyframes.values():
-            database.add(keyframe.keyframe_id, keyframe.features.descriptors)
+        database.add_all((key, k.features.descriptors) for key, k in site.keyframes.items())
         self.site, self._site_finder = site, LoopDetector(database, self._relocalizer)
 
     def drop_map(self, first_keyframe_id: int) -> bool:

@@ -129,8 +129,7 @@ def _numbered(other: SiteMap, first: SiteMap) -> SiteMap:
 def _found(here: SlamMap, there: SlamMap, camera: Camera) -> LoopClosure | None:
     """The keyframe of one map that is found best in the other."""
     database = KeyframeDatabase()
-    for keyframe in there.keyframes.values():
-        database.add(keyframe.keyframe_id, keyframe.features.descriptors)
+    database.add_all((key, k.features.descriptors) for key, k in there.keyframes.items())
     detector = LoopDetector(database, Relocalizer(camera))
     best: LoopClosure | None = None
     n_found = 0

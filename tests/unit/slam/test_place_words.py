@@ -111,3 +111,21 @@ def test_scores_do_not_depend_on_how_keyframes_are_kept_together(
     for key, own in of_key.items():
         shared = np.intersect1d(own, words).tolist()
         assert scores[key] == sum((rarity[word] for word in shared), 0.0)
+
+
+@pytest.mark.parametrize("n", (20, 60, 250))
+def test_keyframes_added_at_once_are_as_if_added_one_by_one(n: int) -> None:
+    common = descriptors(40)
+    keyframes = [(key, np.concatenate([descriptors(9), common[key % 30 :]])) for key in range(n)]
+    at_once, one_by_one = KeyframeDatabase(), KeyframeDatabase()
+    at_once.add_all(iter(keyframes))
+    for key, given in keyframes:
+        one_by_one.add(key, given)
+    for database in (at_once, one_by_one):
+        database.remove(7)
+        database.add(900, common)
+    assert len(at_once) == n and 7 not in at_once
+    words = words_of(np.concatenate([common[25:], keyframes[3][1]]))
+    scores = at_once._scores(words)
+    assert scores.max() > 0 and np.array_equal(scores, one_by_one._scores(words))
+    assert at_once.query(common, n) == one_by_one.query(common, n)
