@@ -6,7 +6,14 @@ import argparse
 import sys
 from typing import Any
 
-from companion.app.cli.options import add_path, amount, command, json_option, made_folder
+from companion.app.cli.options import (
+    add_path,
+    amount,
+    command,
+    json_option,
+    made_folder,
+    made_folder_of,
+)
 from companion.app.stopping import StopSignals
 from companion.errors import InputError
 
@@ -18,6 +25,8 @@ def _map(arguments: argparse.Namespace, signals: StopSignals) -> int | None:
     """Show, verify, export, merge, prune or save; 1 where a map is damaged."""
     from companion.app.maps import map_command as maps
 
+    if arguments.what in ("merge", "prune", "save"):
+        made_folder_of(arguments.out)
     if arguments.what == "show":
         print(maps.show(arguments.map, arguments.json))
     elif arguments.what == "verify":

@@ -71,7 +71,7 @@ def json_option() -> argparse.ArgumentParser:
     return options
 
 
-def made_folder(path: Path | None) -> None:
+def made_folder(path: Path | None, wanted: str = "a folder") -> None:
     """Make the folder that --out names, before any work; InputError where it cannot be written."""
     if path is None:
         return
@@ -81,7 +81,14 @@ def made_folder(path: Path | None) -> None:
             pass
     except OSError as error:
         why = error.strerror or error
-        raise InputError(f"{path}: cannot be written: {why}; --out wants a folder") from error
+        raise InputError(f"{path}: cannot be written: {why}; --out wants {wanted}") from error
+
+
+def made_folder_of(file: Path) -> None:
+    """As `made_folder`, of the file that --out names."""
+    if file.is_dir():
+        raise InputError(f"{file}: is a folder; --out wants a file")
+    made_folder(file.parent, "a file in a folder")
 
 
 def check_span(start_s: float | None, stop_s: float | None) -> None:

@@ -19,6 +19,7 @@ from companion.app.cli.options import (
     held_folder,
     json_option,
     made_folder,
+    made_folder_of,
     seconds,
 )
 from companion.app.progress import Progress, progress_on
@@ -53,6 +54,7 @@ def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int | None:
     elif what == "mission":
         from companion.app.flights_mission import mission
 
+        made_folder_of(arguments.out)
         print(mission(
             arguments.flight, folder, arguments.out, arguments.within, arguments.back
         ))  # fmt: skip

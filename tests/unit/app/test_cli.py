@@ -116,6 +116,17 @@ def test_out_that_cannot_be_written(command: tuple[str | Path, ...]) -> None:
 
 
 @pytest.mark.parametrize(
+    "command",
+    [("map", "prune"), ("map", "save"), ("map", "merge", "a.map"), ("flights", "mission")],
+)
+def test_out_of_a_file_that_cannot_be_written(tmp_path: Path, command: tuple[str, ...]) -> None:
+    out = Path("/proc/nowhere/new.plan")
+    line = refused(companion(*command, "none.map", "--out", out))
+    assert "/proc/nowhere: cannot be written: " in line and "--out wants a file" in line
+    assert f"{tmp_path}: is a folder" in refused(companion(*command, "none.map", "--out", tmp_path))
+
+
+@pytest.mark.parametrize(
     ("arguments", "named"),
     [
         ([], "COMMAND"),
