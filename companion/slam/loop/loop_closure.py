@@ -13,7 +13,12 @@ import numpy as np
 
 from companion.geometry.transforms import Array, Pose, Similarity, angle_between
 from companion.slam.loop.place_recognition import KeyframeDatabase
-from companion.slam.loop.relocalizer import Relocalised, Relocalizer
+from companion.slam.loop.relocalizer import (
+    LOW_FOUND_RATIO,
+    MIN_FOUND_RATIO,
+    Relocalised,
+    Relocalizer,
+)
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 
 N_CANDIDATES = 4
@@ -26,6 +31,9 @@ MAX_TILT_RAD = np.radians(10.0)
 MAX_SCALE_DRIFT = 1.6
 RECENT = 8
 """Newest keyframes that are no loop candidates."""
+N_NEAR, OTHER_PASS, SAME_VIEW = 60, 20, 0.8
+"""Of the keyframes nearest to one, those that are so many ids away, whose optical axis is turned by
+less than this cosine (37 degrees, where descriptors begin to differ), show it in another pass."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,6 +77,27 @@ class LoopDetector:
                 return found
         return None
 
+    def find_near(self, keyframe: Keyframe, here: SlamMap, check: LoopCheck) -> LoopClosure | None:
+        """A confirmed loop closure with a pass nearby that shares no point, or None.
+
+        Most places of a flight over fields or roofs look alike, and of the few candidates by
+        descriptors none may be the place. Drift that is small beside the view leaves it near.
+        """
+        _, ids = here.observations_of(keyframe)
+        known = {k for _, k in here.covisible(ids)} | {keyframe.keyframe_id}
+        axis = keyframe.camera_from_map.rotation[2]
+        near = [
+            k
+            for k in here.nearest(keyframe.centre, N_NEAR, known)
+            if abs(k - keyframe.keyframe_id) >= OTHER_PASS
+            and here.keyframes[k].camera_from_map.rotation[2] @ axis > SAME_VIEW
+        ]
+        for key in near[:N_CANDIDATES]:
+            found = self._try(keyframe, here, here.keyframes[key], here, LOW_FOUND_RATIO)
+            if found is not None and check(found, True):
+                return found
+        return None
+
     def _candidates(
         self, keyframe: Keyframe, near: set[int], here: SlamMap, maps: list[SlamMap]
     ) -> list[int]:
@@ -81,8 +110,9 @@ class LoopDetector:
         return list(dict.fromkeys([*found, *others]))
 
     def _try(
-        self, keyframe: Keyframe, here: SlamMap, other: Keyframe, there: SlamMap
-    ) -> LoopClosure | None:
+        self, keyframe: Keyframe, here: SlamMap, other: Keyframe, there: SlamMap,
+        share: float = MIN_FOUND_RATIO,
+    ) -> LoopClosure | None:  # fmt: skip
         level = keyframe.camera_from_map.rotation.T if here.level and there.level else None
         relocalised = self._relocalizer.relocalise(
             keyframe.features, there, other, level, keyframe.keyframe_id
@@ -96,7 +126,8 @@ class LoopDetector:
             return None
         if here is there and not 1 / MAX_SCALE_DRIFT < here_from_there.scale < MAX_SCALE_DRIFT:
             return None
-        if self._n_confirming(keyframe, here, other, there, here_from_there) < MIN_CONFIRMING:
+        confirming = self._n_confirming(keyframe, here, other, there, here_from_there, share)
+        if confirming < MIN_CONFIRMING:
             return None
         return LoopClosure(keyframe, there, relocalised, here_from_there)
 
@@ -107,14 +138,19 @@ class LoopDetector:
         other: Keyframe,
         there: SlamMap,
         here_from_there: Similarity,
+        share: float,
     ) -> int:
-        """Number of covisible neighbours verified in the other part."""
+        """Number of covisible neighbours verified in the other part, by that share of points."""
         _, ids = here.observations_of(keyframe)
         ranked = [here.keyframes[k] for _, k in here.covisible(ids)]
         neighbours = [k for k in ranked if k is not keyframe][:N_NEIGHBOURS]
         return sum(
             self._relocalizer.verify(
-                k.features, there, other, camera_from_there(k.camera_from_map, here_from_there)
+                k.features,
+                there,
+                other,
+                camera_from_there(k.camera_from_map, here_from_there),
+                share,
             )
             is not None
             for k in neighbours

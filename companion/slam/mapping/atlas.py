@@ -33,6 +33,8 @@ EXPECTED_FOUND_RATIO = 0.1
 """Found ratio that suffices near the latest keyframes where no attitude is measured."""
 LOOP_COOLDOWN = 8
 """Keyframes after a loop closure before the next search."""
+NEAR_LOOP_EVERY = 4
+"""Keyframes from one search nearby to the next, at the end: neighbours see the same."""
 MAX_DRIFT_RATIO, MAX_DRIFT = 0.04, 0.3
 """Largest loop error relative to the path flown since, and in map units."""
 MIN_LOOP_SHIFT, MIN_LOOP_ROTATION_RAD, MIN_LOOP_LOG_SCALE = 0.01, np.radians(0.2), 0.005
@@ -213,6 +215,22 @@ class Atlas:
                     joined.append(closed)
                     break
         return joined
+
+    def close_near_loops(self) -> list[LoopClosed]:
+        """Close loops between passes near each other in the active map, at the end of a flight.
+
+        Without attitude alone: where gravity is measured little drift is left.
+        """
+        segment, closed = self.map, []
+        if segment.level or segment.held:
+            return []
+        for key in list(segment.keyframes)[::-NEAR_LOOP_EVERY]:
+            keyframe = segment.keyframes.get(key)
+            found = keyframe and self._finder.find_near(keyframe, segment, self._plausible)
+            loop = found and self._close(segment, self.mapper, found)
+            if loop:
+                closed.append(loop)
+        return closed
 
     def index_keyframe(self, keyframe: Keyframe) -> None:
         """Add a keyframe to place recognition that was not added by `insert_keyframe`."""

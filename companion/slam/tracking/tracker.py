@@ -183,7 +183,7 @@ class Tracker:
         self._ahead.close()
         self.map_lock.end_order()
         self._worker.close()
-        joined = self.atlas.join_maps()
+        joined = [*self.atlas.join_maps(), *self.atlas.close_near_loops()]
         self.atlas.free_index()
         return [*self._worker.done(), *joined]
 

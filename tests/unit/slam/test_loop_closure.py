@@ -215,6 +215,37 @@ def test_repetitive_facade_is_no_loop(level: bool) -> None:
     assert find(29, slam_map, [slam_map]) is None
 
 
+@pytest.mark.parametrize("level", [True, False], ids=["level", "vision alone"])
+def test_passes_that_no_place_word_joined_are_joined_in_the_end(level: bool) -> None:
+    """There and back beside itself, nothing indexed; with attitude all is as it was."""
+    ground = Ground(np.random.default_rng(6))
+    corners = [(0.0, 0.0), (24.0, 0.0), (24.0, 2.0), (0.0, 2.0)]
+    path = [pose for a, b in itertools.pairwise(corners) for pose in line(a, b, 14, 0.0)]
+    slam_map = mapped(ground, path, NOWHERE, memory=6)
+    slam_map.level = level
+    bend(slam_map, 0.01)
+    off = [float(np.linalg.norm(slam_map.keyframes[41].centre - path[-1].translation))]
+    atlas = Atlas(FeaturesConfig(), CAMERA, MapLock())
+    atlas.segments = [slam_map]
+    closed = atlas.close_near_loops()
+    off.append(float(np.linalg.norm(slam_map.keyframes[41].centre - path[-1].translation)))
+    if level:
+        assert not closed and off[1] == off[0]
+    else:
+        assert closed and all(loop.same_map for loop in closed)
+        assert off[1] < 0.3 * off[0]
+
+
+def test_a_repetitive_facade_beside_itself_is_no_loop() -> None:
+    """Two passes along it, so far apart that windows and not corners are the same."""
+    ground = Ground(np.random.default_rng(7))
+    ground.repeat(period=4.0)
+    slam_map = mapped(ground, line((-24, 0), (24, 0), 60, 0.0), NOWHERE)
+    atlas = Atlas(FeaturesConfig(), CAMERA, MapLock())
+    atlas.segments = [slam_map]
+    assert atlas.close_near_loops() == []
+
+
 def test_places_of_its_own_map_keep_none_of_another_out() -> None:
     """A camera that comes to one place again and again, seen from aside in the other map."""
     ground = Ground(np.random.default_rng(8))
