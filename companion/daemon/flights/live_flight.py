@@ -165,15 +165,18 @@ class LiveFlight:
             self._processes.publish(Parcel.of(frame))
 
     def take(self, message: Taken) -> None:
-        """Take what does not come of its stages, but for frames; never waits."""
-        if not self._takes:
-            return
-        if not isinstance(message, LinkBytes):
+        """Take what does not come of its stages, but for frames; never waits.
+
+        Until `finish`, also where localisation has died: that may come between what a gate decided
+        and what the link then carried, and one without the other is no record.
+        """
+        takes = self._takes if isinstance(message, Warned) else self._flies
+        if takes and isinstance(message, LinkBytes):
+            self._reads.append(message)
+            if message.t_ns - self._reads[0].t_ns >= GATHER_NS:
+                self._publish_reads()
+        elif takes:
             self._processes.publish(Parcel.of(message))
-            return
-        self._reads.append(message)
-        if message.t_ns - self._reads[0].t_ns >= GATHER_NS:
-            self._publish_reads()
 
     def publish_health(self, health: Health, origin: GeoOrigin | None) -> None:
         """Send health to viewers and results once a second, and a changed world's origin."""

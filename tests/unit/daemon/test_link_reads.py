@@ -11,7 +11,8 @@ import pytest
 from companion.config import Config
 from companion.daemon.flights import live_flight as module
 from companion.daemon.flights.live_flight import GATHER_NS, LiveFlight
-from companion.flight_notes import LinkBytes, LinkReads
+from companion.flight_notes import GateStep, LinkBytes, LinkReads
+from companion.messages import Warned
 from companion.runtime.parcel import Parcel
 from companion.stages import recorder_work
 from companion.telemetry import ArmedSample
@@ -82,6 +83,18 @@ def test_a_flight_ends_with_all_bytes_of_its_link(flight: LiveFlight) -> None:
     flight.take(read(1))
     flight.finish(lambda _: None)  # type: ignore[arg-type,return-value]
     assert published(flight) == [LinkReads(1, (read(1),)), "finished"]
+
+
+def test_a_localisation_that_dies_parts_no_decision_from_its_bytes(flight: LiveFlight) -> None:
+    step = GateStep(1, "pose", "frame", 0, True, {})
+    flight.take(step)
+    flight._processes.over = True  # type: ignore[misc]
+    flight.take(read(2))
+    flight.take(ArmedSample(3, True))
+    flight.take(Warned(4, "published by the stage that gave it"))
+    flight.finish(lambda _: None)  # type: ignore[arg-type,return-value]
+    kinds = [type(each) for each in published(flight)]
+    assert kinds == [GateStep, ArmedSample, LinkReads, str]
 
 
 def test_they_are_recorded_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
