@@ -91,6 +91,8 @@ class HealthWatch:
         self._odometry: Odometry | None = None
         self._odometry_ns = 0
         self._progress_ns = self._began_ns
+        self._has_tracked = False
+        """True once localisation has given anything: a later start compiles nothing any more."""
         self.flight_due = False
         """True while a flight is to begin and cannot yet: then it is missed that no pose comes."""
         self._scale = ""
@@ -145,6 +147,7 @@ class HealthWatch:
         if odometry.state is not TrackState.TRACKING:
             self._settled_ns = now_ns + SETTLE_NS
         self._odometry, self._odometry_ns, self._progress_ns = odometry, now_ns, now_ns
+        self._has_tracked = True
         self._pose.done(now_ns, odometry.t_ns)
         came_ns = next((at for t, at in tuple(self._arrivals) if t == odometry.t_ns), None)
         if came_ns is not None:
@@ -171,7 +174,8 @@ class HealthWatch:
         now_ns = self._clock.now_ns()
         frames_come = now_ns - self._last_frame_ns < GOVERN_NS
         is_wanted = self._flights.current is not None or self.flight_due
-        if not is_wanted or not frames_come or self._starts:
+        compiles = self._starts and not self._has_tracked
+        if not is_wanted or not frames_come or compiles:
             self._progress_ns = now_ns
         return now_ns - self._progress_ns < PATIENCE_NS
 
