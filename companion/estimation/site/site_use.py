@@ -195,12 +195,14 @@ def wrong_metres(site: SiteMap, camera: Camera) -> str:
     below the standard deviation of a feature of the map.
     """
     theirs = site.parts[-1].camera
+    if not (theirs.assumed or camera.assumed):
+        return ""
     off = abs(float(np.log(theirs.focal_px / camera.focal_px)))
     some = site.keyframes[:: 1 + len(site.keyframes) // N_LOOKED_AT]
     sigmas = np.concatenate([1.0 / k.whitening[:, 0, 0] for k in some])
     away = np.concatenate([np.linalg.norm(k.normalised, axis=1) for k in some])
     allowed = float(np.median(sigmas) / np.sqrt(np.mean(away**2)))
-    if not (theirs.assumed or camera.assumed) or off <= allowed:
+    if off <= allowed:
         return ""
     whose = "its camera's" if theirs.assumed else "the camera's"
     return (
