@@ -17,9 +17,24 @@ SO_TIMESTAMPNS = 35  # Linux, which Python has no name for
 TIMESPEC = struct.Struct("qq")
 MOST_AGE_NS = 500_000_000
 STEP_NS = 1_000_000
+READINGS = 5
 PEER_SILENT_NS = 1_500_000_000
 NETWORK_BYTES_PER_S = 250e3
 """More than any autopilot sends or receives."""
+
+
+def clocks_at_once() -> tuple[int, int]:
+    """CLOCK_MONOTONIC and the system clock, in nanoseconds, as near in time as they can be read.
+
+    Read again where the process had to wait between them, which would look like a clock that was
+    set; not for ever, since on a starved computer it may wait each time.
+    """
+    for _ in range(READINGS):
+        now_ns = time.monotonic_ns()
+        unix_ns = time.time_ns()
+        if time.monotonic_ns() - now_ns < STEP_NS // 2:
+            break
+    return now_ns, unix_ns
 
 
 class KernelStamps:
@@ -30,12 +45,13 @@ class KernelStamps:
     """
 
     def __init__(self) -> None:
-        self._unix_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
+        now_ns, unix_ns = clocks_at_once()
+        self._unix_minus_monotonic_ns = unix_ns - now_ns
 
     def monotonic_ns(self, unix_ns: int | None) -> int:
         """Arrival of a packet that has just been read; `unix_ns` is the kernel's stamp."""
-        now_ns = time.monotonic_ns()
-        offset_ns = time.time_ns() - now_ns
+        now_ns, unix_now_ns = clocks_at_once()
+        offset_ns = unix_now_ns - now_ns
         was_set = abs(offset_ns - self._unix_minus_monotonic_ns) > STEP_NS
         self._unix_minus_monotonic_ns = offset_ns
         if unix_ns is None or was_set:
