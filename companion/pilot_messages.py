@@ -75,6 +75,7 @@ SITE_OTHER_CAMERA = PilotMessage(NOTICE, "saved map is of another camera")
 SITE_UNREADABLE = PilotMessage(WARNING, "saved map cannot be read: not used")
 SITE_DAMAGED = PilotMessage(NOTICE, "saved map damaged: used in part")
 OTHER_LENS = PilotMessage(WARNING, "focal length looks wrong: calibrate")
+SETUP_UNPROVEN = PilotMessage(WARNING, "{what} unproven: turn it by hand", {"what": 11})
 MOUNT_CORRECTED = PilotMessage(NOTICE, "camera mount angle corrected")
 IMU_NOT_USED = PilotMessage(NOTICE, "autopilot IMU data not used")
 IMU_USED = PilotMessage(INFO, "autopilot IMU data used again")
@@ -312,6 +313,7 @@ JOURNAL_ONLY = frozenset({
     "the rolling shutter looks slower or faster than camera.readout_ms",
     "measured depths contradict the other scales: check baseline and calibration",
     "measured depths agree with the other scales again",
+    "camera turns with the body as its mount says", "turns look as the focal length says",
 })  # fmt: skip
 """Kinds of `Warned` that do not concern a pilot."""
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import signal
 from collections.abc import Callable, Coroutine
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,15 +34,13 @@ from companion.daemon.page_child import PageChild, SettingsSource
 from companion.daemon.periodic_checks import PeriodicChecks
 from companion.daemon.pose.senders import Senders
 from companion.daemon.recorder_notes import RecorderNotes
+from companion.daemon.setup_proof import SetupProof
 from companion.daemon.spared import spared
 from companion.daemon.status_document import StatusDocument
 from companion.daemon.stop_request import StopRequest
 from companion.daemon.vehicle_reports import VehicleReports, flight_recording
 from companion.geometry.geodesy import GeoOrigin
-from companion.messages import (
-    Frame,
-    Warned,
-)
+from companion.messages import Frame, Warned
 from companion.messages.run_facts import RunFacts
 from companion.meters import LatencyMeter
 from companion.pilot_messages import PilotText, of_warning
@@ -85,9 +84,10 @@ class Daemon:
         self._stop = StopRequest(journal)
         self._settings = settings = SettingsInForce(
             load, self._autopilot_boot_s, self._is_heard, journal, self._tell_pilot,
-            lambda why: self._on_warned(Warned(clock.now_ns(), NOT_KEPT, why)), self._reconfigured,
+            partial(self._problem, NOT_KEPT), self._reconfigured,
         )  # fmt: skip
         config = settings.config
+        self._proof = proof = SetupProof(config, self._tell_pilot, partial(self._problem, NOT_KEPT))
         check_calibration(config.camera, config.mount)
         self._service = ServiceManager()
         self._loop_delay = LatencyMeter()
@@ -130,7 +130,7 @@ class Daemon:
             )  # fmt: skip
         self._starts = starts = FlightStarts(
             settings, self._feed, flights, self._senders, self._reports, watch, journal, self._stop,
-            lambda why: self._on_warned(Warned(clock.now_ns(), NOT_BEGUN, why)),
+            partial(self._problem, NOT_BEGUN),
         )  # fmt: skip
         if self._link is not None and self._reports is not None and config.control.enabled:
             self._ground = GroundControl(
@@ -145,9 +145,11 @@ class Daemon:
         )  # fmt: skip
         self._checks = PeriodicChecks(
             settings, clock, journal, self._service, self._feed, self._link, link_watch, flights,
-            dates, watch, starts, self._stop,
+            dates, watch, starts, proof, self._stop,
         )  # fmt: skip
-        self._status = StatusDocument(watch, settings, flights, starts, self._link, journal, clock)
+        self._status = StatusDocument(
+            watch, settings, flights, starts, proof, self._link, journal, clock
+        )
         self._page: PageChild | None = None
         if config.page.listen:
             self._page = PageChild(
@@ -200,6 +202,7 @@ class Daemon:
                 await part.stop()
             await asyncio.wait([feed_closed], timeout=0.2)
             await loop.run_in_executor(None, self._settings.close, WRITE_S)
+            await loop.run_in_executor(None, self._proof.close, WRITE_S)
             if self._ground is not None:
                 await loop.run_in_executor(None, self._ground.close, WRITE_S)
             self._service.close()
@@ -271,6 +274,7 @@ class Daemon:
             text = of_warning(warning.what, warning.detail, warning.good)
             if text is not None:
                 self._soon(self._tell_pilot, text)
+        self._soon(self._proof.take, warning)
         self._soon(self._flights.take, warning)
 
     def _on_telemetry(self, sample: Telemetry) -> None:

@@ -12,6 +12,7 @@ from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.flights import Flights
 from companion.daemon.health_watch import HealthWatch
 from companion.daemon.link_watch import LinkWatch
+from companion.daemon.setup_proof import SetupProof
 from companion.daemon.stop_request import BAD_INPUT, StopRequest
 from companion.health import Health
 from companion.timing.clock import FlightClock
@@ -35,13 +36,13 @@ class PeriodicChecks:
         self, settings: SettingsInForce, clock: FlightClock, journal: Journal,
         service: ServiceManager, feed: CameraFeed, link: AutopilotLink | None,
         link_watch: LinkWatch | None, flights: Flights, dates: FlightDates, watch: HealthWatch,
-        starts: FlightStarts, stop: StopRequest,
+        starts: FlightStarts, proof: SetupProof, stop: StopRequest,
     ) -> None:  # fmt: skip
         self._settings, self._clock, self._journal = settings, clock, journal
         self._service = service
         self._feed, self._link, self._link_watch = feed, link, link_watch
         self._flights, self._dates, self._watch = flights, dates, watch
-        self._starts, self._stop = starts, stop
+        self._starts, self._proof, self._stop = starts, proof, stop
         self._missing = MissingDevices(settings.config.daemon.missing_device_s)
         self._is_ready = False
         self._progress = True
@@ -62,6 +63,10 @@ class PeriodicChecks:
             self._check_start(health)
             self._check_stages()
             self._report(health)
+            if self._settings.config.feedback.mode != "off":
+                self._proof.step(
+                    self._starts.camera, health.feedback.sending, self._starts.reported_armed
+                )
             if self._feed.fault is not None:
                 self._stop.fail(str(self._feed.fault), BAD_INPUT)
             self._step_dates()

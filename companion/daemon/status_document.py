@@ -10,6 +10,7 @@ from companion.daemon.control.settings_in_force import SettingsInForce
 from companion.daemon.flight_starts import FlightStarts
 from companion.daemon.flights.flights import Flights
 from companion.daemon.health_watch import HealthWatch
+from companion.daemon.setup_proof import SetupProof
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.system.journal import Journal
@@ -23,10 +24,11 @@ class StatusDocument:
 
     def __init__(
         self, watch: HealthWatch, settings: SettingsInForce, flights: Flights,
-        starts: FlightStarts, link: AutopilotLink | None, journal: Journal, clock: FlightClock,
+        starts: FlightStarts, proof: SetupProof, link: AutopilotLink | None, journal: Journal,
+        clock: FlightClock,
     ) -> None:  # fmt: skip
         self._watch, self._settings, self._flights = watch, settings, flights
-        self._starts, self._link = starts, link
+        self._starts, self._proof, self._link = starts, proof, link
         self._journal, self._clock = journal, clock
 
     def __call__(self) -> dict[str, Any]:
@@ -43,6 +45,7 @@ class StatusDocument:
             "flights": str(Path(config.daemon.flights).resolve()),
             "viewers_port": flight.viewing.port if flight and flight.viewing else 0,
             "mount_known": camera is not None and camera.body_from_camera is not None,
+            "unproven": self._proof.missing,
             "size": [camera.width, camera.height] if camera is not None else None,
             "origin": asdict(origin) if origin is not None else None,
             "warnings": self._warnings(),

@@ -16,6 +16,10 @@ MOUNT_WARNINGS = (
     "the autopilot's attitude is not the camera's and is not used",
 )
 MOUNT_GOOD = "camera turns with the body again: attitude used"
+TURN = (
+    "Turn the drone by hand about all its axes for 20 seconds, over something with structure: then "
+    "this is ticked off."
+)
 RECENT_S = 120.0
 DEVICES = "/setup/devices", "Cameras and serial ports"
 MOUNT = "/setup/mount", "Find the mount"
@@ -83,7 +87,10 @@ def _lens(status: Mapping[str, Any], config: Config) -> Step:
     camera = config.camera
     own = camera.source == "pattern" or (camera.source == "file" and not camera.calibration)
     if camera.calibration:
-        return Step("lens", "Lens", "done", f"Calibrated: {camera.calibration}")
+        found = f"Calibrated: {camera.calibration}"
+        if "lens" in status.get("unproven", ()):
+            found += ". Turns of the drone have not shown yet that it fits."
+        return Step("lens", "Lens", "done", found)
     if own:
         return Step("lens", "Lens", "done", "This camera brings its own calibration.")
     found = f"Not calibrated: taken to be {camera.assumed_hfov_deg:g} degrees wide, undistorted."
@@ -111,6 +118,9 @@ def _mount(status: Mapping[str, Any], config: Config) -> Step:
             f"Stated: roll {mount.roll_deg:g}, pitch {mount.pitch_deg:g}, yaw {mount.yaw_deg:g} "
             "degrees. Nothing contradicts it."
         )
+    if "mount" in status.get("unproven", ()):
+        found += " Nothing has shown yet that it is so."
+        return Step("mount", "Mount", "todo", found, TURN, *MOUNT)
     return Step("mount", "Mount", "done", found)
 
 

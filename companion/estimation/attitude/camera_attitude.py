@@ -16,6 +16,7 @@ from companion.estimation.attitude.attitude_verdict import AttitudeVerdict, Verd
 from companion.estimation.attitude.head_yaw import HeadYaw
 from companion.estimation.attitude.map_tilt import RotationOf
 from companion.estimation.attitude.mount_estimation import (
+    FITS_RAD,
     RATE_STEP_NS,
     MountEstimate,
     MountEstimator,
@@ -30,8 +31,9 @@ MAX_HEAD_EXTRAPOLATION_NS = 250_000_000
 MOUNT_EVERY_NS = 3_000_000_000
 MIN_MOUNT_RAD, MIN_DELAY_S = np.radians(0.3), 0.006
 """Smaller corrections of mount and delay are not applied."""
-REPORTED_DEG, REPORTED_S = 1.5, 0.025
-"""Larger corrections are reported to the user."""
+REPORTED_S = 0.025
+"""Larger corrections of the delay are reported to the user."""
+MOUNT_FITS = "camera turns with the body as its mount says"
 
 
 class AttitudeCheck(NamedTuple):
@@ -71,7 +73,7 @@ class CameraAttitude:
         self._delay_ns = 0 if gimbal is None else round(gimbal.delay_ms * 1e6)
         """Estimated delay of autopilot stamps, of a gimbal's with one."""
         self._estimator = MountEstimator(self._mount)
-        self._reported = False
+        self._reported = self._proven = False
         self._due_ns = 0
         self._keyframe_attitudes: dict[int, tuple[Array, Array] | None] = {}
         """`ned_from_body` and body rates of keyframes, kept beyond the history."""
@@ -207,9 +209,15 @@ class CameraAttitude:
             return AttitudeCheck([])
         self._due_ns = t_ns + MOUNT_EVERY_NS
         found = self._estimator.estimate()
-        return (
-            self._correct(t_ns, found) if found is not None and found.certain else AttitudeCheck([])
-        )
+        if found is None or not found.certain:
+            return AttitudeCheck([])
+        checked = self._correct(t_ns, found)
+        if found.fits and not self._proven:
+            self._proven = True
+            off_deg = np.degrees(np.linalg.norm(found.turn_camera_rad))
+            detail = f"within {off_deg:.1f} degrees"
+            checked.warnings.append(Warned(t_ns, MOUNT_FITS, detail, good=True))
+        return checked
 
     def contradicted(self, t_ns: int, why: str) -> AttitudeCheck:
         """Ignore the attitude, as the camera sits otherwise than stated, by other evidence.
@@ -247,14 +255,12 @@ class CameraAttitude:
         self._delay_ns = int(found.offset_s * 1e9)
         after = self.at(t_ns)
         attitude_change = None if before is None or after is None else before @ after.T
-        mount_deg = np.degrees(found.turn_camera_rad)
-        slight = (
-            float(np.linalg.norm(mount_deg)) < REPORTED_DEG and abs(found.offset_s) < REPORTED_S
-        )
+        off_by_rad = float(np.linalg.norm(found.turn_camera_rad))
+        slight = off_by_rad < float(FITS_RAD) and abs(found.offset_s) < REPORTED_S
         if self._reported or slight:
             return AttitudeCheck([], now_from_before, attitude_change)
         self._reported = True
-        about = " ".join(f"{v:+.1f}" for v in mount_deg)
+        about = " ".join(f"{v:+.1f}" for v in np.degrees(found.turn_camera_rad))
         detail = (
             f"the camera is turned by {about} degrees about its right, down and forward axes, "
             f"telemetry is {found.offset_s * 1e3:+.0f} ms late; put that into the calibration"

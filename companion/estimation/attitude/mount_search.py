@@ -12,7 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.estimation.attitude.attitude_history import AttitudeHistory
-from companion.estimation.attitude.mount_estimation import MountEstimate, MountEstimator
+from companion.estimation.attitude.mount_estimation import (
+    MAX_RESIDUAL_RAD,
+    MountEstimate,
+    MountEstimator,
+)
 from companion.geometry.transforms import Array
 from companion.telemetry import AttitudeSample
 
@@ -27,9 +31,6 @@ FITS_RATIO, FITS_RAD = 0.25, np.radians(4.0)
 ROUNDS = 4
 MIN_FITTING = 0.6
 """Least share of pairs that fit; fewer, and the camera does not turn with the body."""
-MAX_RESIDUAL_RAD = np.radians(2.5)
-"""Largest median residual: beyond, the lens is wrong, or the camera hangs in a gimbal. A camera on
-a network, stamped as its images arrive, 50 ms to and fro, is turned by 1.5 degrees in that time."""
 CERTAIN_RAD = np.radians(1.0)
 """Largest standard deviation about any axis. How late stamps are need not be known for it."""
 

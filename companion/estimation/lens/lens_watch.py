@@ -15,6 +15,9 @@ from companion.slam.features.view import View
 from companion.slam.map.sparse_map import SlamMap
 
 OTHER_LENS = "focal length looks wrong: calibrate the lens"
+LENS_FITS = "turns look as the focal length says"
+FITS = 0.05
+"""A focal length that is right within this, at two standard deviations, is as stated."""
 TURN_RAD, LEAST_TURN_RAD = np.radians(4.0), np.radians(2.0)
 """A pair is taken once the camera has turned by the first, or at last by the second."""
 LONGEST_NS = 1_500_000_000
@@ -52,6 +55,7 @@ class LensWatch:
         self._map: SlamMap | None = None
         self._start: _Start | None = None
         self._pairs: list[tuple[float, float]] = []
+        self._proven = False
         self.watches = True
         """False once the focal length is known: nothing that comes later would be said."""
 
@@ -108,11 +112,17 @@ class LensWatch:
         found = self.estimate
         if found is None or found.sigma > SURE_SIGMA:
             return []
-        is_other = abs(found.ratio - 1.0) > SIGMAS * found.sigma
+        off = abs(found.ratio - 1.0)
+        is_other = off > SIGMAS * found.sigma
         if is_other or found.n >= MAX_PAIRS:
             self.watches, self._map, self._start = False, None, None
         detail = f"it seems to be {found.ratio:.2f} +- {found.sigma:.2f} times what is stated"
-        return [Warned(t_ns, OTHER_LENS, detail)] if is_other else []
+        if is_other:
+            return [Warned(t_ns, OTHER_LENS, detail)]
+        if self._proven or off + 2.0 * found.sigma > FITS:
+            return []
+        self._proven = True
+        return [Warned(t_ns, LENS_FITS, detail, good=True)]
 
 
 def _rays_of(view: View) -> Rays:

@@ -34,7 +34,7 @@ def checks_with(**parts: Any) -> PeriodicChecks:
     """Checks of which only the given parts are there."""
     names = (
         "settings", "clock", "journal", "service", "feed", "link", "link_watch", "flights",
-        "dates", "watch", "starts", "stop",
+        "dates", "watch", "starts", "proof", "stop",
     )  # fmt: skip
     there: dict[str, Any] = dict.fromkeys(names)
     return PeriodicChecks(**there | {"settings": SimpleNamespace(config=Config()), **parts})

@@ -117,6 +117,7 @@ def test_it_is_not_called_ready_before_the_parameters_are_examined() -> None:
 @pytest.mark.parametrize("change, key, words", [
     ({"sources": [{"name": "camera", "state": "missing"}], "size": None}, "camera", "missing"),
     ({"mount_known": False}, "mount", "not known how the camera sits"),
+    ({"unproven": ["mount", "lens"]}, "mount", "Nothing has shown yet"),
     ({"feedback": {"mode": "odometry", "why_not": "no metric scale"}}, "ready", "no metric scale"),
 ])  # fmt: skip
 def test_the_last_step_names_the_first_thing_that_is_not(

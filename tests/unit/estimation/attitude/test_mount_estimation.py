@@ -60,10 +60,19 @@ def test_mount_error_and_delay_are_estimated(late_s: float) -> None:
     assert found.sigma_offset_s < 0.01
 
 
+@pytest.mark.parametrize(
+    "off_deg, fits",
+    [(0.0, True), (1.0, True), (3.0, False), (20.0, False), (90.0, False), (180.0, False)],
+)
+def test_a_mount_fits_within_what_can_be_measured_by_hand(off_deg: float, fits: bool) -> None:
+    found = estimated(np.radians([0.0, 0.6 * off_deg, 0.8 * off_deg]), 0.03)
+    assert found is not None and found.fits == fits
+
+
 def test_without_rotation_nothing_is_concluded() -> None:
     found = estimated(np.radians([3.0, 0, 0]), 0.05, still=True)
     assert found is not None
-    assert not found.certain
+    assert not found.certain and not found.fits
 
 
 def test_too_little_data_gives_none() -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from companion.estimation.inertial.steady_level import SteadyLevel
 from companion.estimation.inertial.turn_integral import TurnIntegral
-from companion.estimation.lens.lens_watch import OTHER_LENS, LensWatch
+from companion.estimation.lens.lens_watch import LENS_FITS, OTHER_LENS, LensWatch
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, rotation_from_vector, yaw_rotation
 from companion.messages import Warned
@@ -64,6 +65,11 @@ class Gyroscopes(SteadyLevel):
         return first.T @ last @ noise, sigma_rad
 
 
+def wrong_of(*arguments: Any, **named: Any) -> list[Warned]:
+    """The same, without good news."""
+    return [each for each in said_of(*arguments, **named) if not each.good]
+
+
 def said_of(
     stated: float, path: Path = in_the_air, relief_m: float = 3.0, seconds: float = 40.0,
     mount_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -115,7 +121,7 @@ def test_ten_percent_are_said_once(stated: float, path: Path, relief_m: float) -
 @pytest.mark.parametrize(("stated", "n_said"), [(0.9, 1), (1.0, 0), (1.1, 1)])
 def test_a_turn_on_the_spot_tells_it(stated: float, n_said: int) -> None:
     """A camera that sways by decimetres only: other focal lengths fit nearly as well."""
-    assert len(said_of(stated, on_the_spot, relief_m=0.0, seconds=10.0)) == n_said
+    assert len(wrong_of(stated, on_the_spot, relief_m=0.0, seconds=10.0)) == n_said
 
 
 def test_it_is_said_after_seconds_of_turning() -> None:
@@ -126,13 +132,24 @@ def test_it_is_said_after_seconds_of_turning() -> None:
 @pytest.mark.parametrize("stated", [0.98, 1.0, 1.02])
 @pytest.mark.parametrize("path", [in_the_air, by_hand])
 def test_nothing_is_said_of_two_percent(stated: float, path: Path) -> None:
-    assert not said_of(stated, path)
+    assert not wrong_of(stated, path)
+
+
+@pytest.mark.parametrize("path", [in_the_air, by_hand])
+def test_turns_prove_it_once(path: Path) -> None:
+    (warned,) = said_of(1.0, path)
+    assert warned.what == LENS_FITS and warned.good
+
+
+@pytest.mark.parametrize("stated", [0.95, 1.05])
+def test_five_percent_are_not_proven(stated: float) -> None:
+    assert LENS_FITS not in {each.what for each in said_of(stated, by_hand, 0.6)}
 
 
 @pytest.mark.parametrize("mount_rad", [(0.14, 0.0, 0.0), (0.084, 0.09, 0.067)])
 def test_turns_told_by_a_wrong_mount_do_not_count(mount_rad: tuple[float, float, float]) -> None:
     """Of 8 degrees: they make the focal length look 10 to 16 % longer."""
-    assert said_of(1.0, seconds=30.0, mount_rad=mount_rad) == []
+    assert wrong_of(1.0, seconds=30.0, mount_rad=mount_rad) == []
 
 
 def test_nothing_is_said_without_turns() -> None:
