@@ -18,16 +18,16 @@ demo: opencl
 # First what only computes, and the checks of types beside it; then flights in real time, one for
 # each core, which take 0.8 of one and more: three at once on two cores are all late, and take longer
 # than one after the other. Beside them fly those that hardly need a processor. Last what wants the
-# computer for itself. Files in which one of these fails are run once more, one after the other: a
-# machine that others use too may be too busy for one, and in some files one flight goes through all
-# tests.
+# computer for itself. Files in which a test fails are run once more, one after the other: a machine
+# that others use too may be too busy for one, and in some files one flight goes through all tests.
 test: $(VENV)/.installed-dev opencl
 	$(MAKE) --no-print-directory --jobs=2 lint computed
 	$(MAKE) --no-print-directory --jobs=2 flights light
 	$(BIN)/pytest tests/system tests/firmware $(ALONE) $(SLOWEST) || $(ONCE_MORE)
 
+computed: KIND = not real_time
 computed: loops
-	$(BIN)/pytest -m "not real_time" --ignore tests/live --ignore tests/system -n 3 $(IN_ORDER)
+	$(BIN)/pytest -m "$(KIND)" --ignore tests/live --ignore tests/system -n 3 $(IN_ORDER) || $(ONCE_MORE)
 
 flights: $(VENV)/.installed-dev
 	$(BIN)/pytest -m "real_time and not light and not alone" $(FLIGHTS) -n $$(nproc) $(IN_ORDER) || \
@@ -45,8 +45,9 @@ SLOWEST = --durations 60 --durations-min 2
 ALONE = $(shell grep -l mark.alone tests/live/test_*.py)
 LIGHT = $(shell grep -rl --include='test_*.py' real_time tests/unit; grep -l mark.light tests/live/test_*.py)
 FLIGHTS = $(filter-out $(ALONE) $(LIGHT), $(shell ls tests/live/test_*.py; grep -rl real_time --include='test_*.py' tests/replay))
+KIND = real_time
 ONCE_MORE = { [ $$? -eq 1 ] && files=$$($(FAILED_FILES)) && echo "ONCE MORE, one after the other: $$files" && \
-  $(BIN)/pytest -m real_time $(CACHE) $$files; }
+  $(BIN)/pytest -m "$(KIND)" $(CACHE) $$files; }
 FAILED_FILES = $(BIN)/python -c "import json; \
   failed = json.load(open('.pytest_cache/$(if $(CACHE),light/)v/cache/lastfailed')); \
   print(*sorted({name.partition('::')[0] for name in failed}))"
