@@ -5,7 +5,8 @@
 Flies the camera and the autopilot of the tests in real time: the mount is found by hand and the
 lens calibrated, with pictures while each goes on; then the other views, in flight and after it.
 Prints what each view is wider than its screen by, and what the browser complained of. Once all
-parts are there, OUT has docs/page_views.webp too.
+parts are there, OUT has the pictures of docs/page.md too: page_now.png, page_setup.png and
+page_views.webp.
 """
 
 from __future__ import annotations
@@ -21,12 +22,16 @@ from PIL import Image
 from companion.page.codes import shown
 from tests.live.test_set_up_in_browser import boards, in_hands
 from tests.support.browser import Browser
+from tests.support.cameras.http_camera import RATE_HZ
 from tests.support.processes.paged import Paged
 
 SCREENS = {"phone": (390, 844), "desk": (1280, 800)}
 LONG_MS = 200_000
+RATE = f"camera.rate_hz={RATE_HZ:g}"
 SHEET = ("lens_6", "mount_found", "map", "flight", "settings")
 SHEET_SCREEN, SHEET_GAP = (260, 563), 12
+ALONE = {"now": "phone", "setup": "desk"}
+"""Views that docs/page.md shows by themselves."""
 
 
 class Operator:
@@ -61,6 +66,8 @@ class Operator:
             self.page.screenshot(path=self._out / f"{name}_{screen}.png", full_page=True)
             if screen == "phone" and name in SHEET:
                 self.page.screenshot(path=self._out / f"{name}_sheet.png")
+            if screen == ALONE.get(name):
+                self.page.screenshot(path=self._out / f"page_{name}.png")
             over = self.page.evaluate("document.documentElement.scrollWidth") - width
             print(f"{name}, {screen}: {max(over, 0)} pixels too wide")
         print(*self._browser.complaints, sep="\n", end="", flush=True)
@@ -147,7 +154,7 @@ def main() -> None:
             by_hand = {} if name == "views" else {"path": in_hands, "mounted": name == "lens"}
             with (
                 tempfile.TemporaryDirectory() as folder,
-                Paged(Path(folder), **by_hand) as paged,  # type: ignore[arg-type]
+                Paged(Path(folder), RATE, **by_hand) as paged,  # type: ignore[arg-type]
                 Browser(*SCREENS["phone"]) as browser,
             ):
                 paged.until_served()
