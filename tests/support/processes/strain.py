@@ -10,6 +10,8 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
 
 TICK_S = 0.02
@@ -56,6 +58,17 @@ class Strain:
             withheld_s = too_many * (now_s - before_s) + max(0.0, now_s - before_s - TICK_S)
             self._withheld.append((round(now_s * 1e9), withheld_s))
             before_s = now_s
+
+
+@contextmanager
+def within(limit_s: float) -> Iterator[None]:
+    """What is done takes no longer than so on a machine without load; else AssertionError."""
+    with Strain() as strain:
+        begun_ns = time.monotonic_ns()
+        yield
+        took_s = 1e-9 * (time.monotonic_ns() - begun_ns)
+        allowed_s = strain.allowed_s(limit_s, begun_ns)
+        assert took_s < allowed_s, f"took {took_s:.2f} s, of {allowed_s:.2f} s"
 
 
 def _n_running() -> int:

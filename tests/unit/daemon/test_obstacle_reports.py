@@ -401,10 +401,11 @@ def test_nothing_is_told_of_the_flight_before() -> None:
 
 
 def test_it_goes_out_ten_times_a_second() -> None:
+    approach = Approach()
+    approach.fly(2.0)
+    approach.link.alive = True
+
     async def fly() -> int:
-        approach = Approach()
-        approach.fly(2.0)
-        approach.link.alive = True
         task = asyncio.create_task(approach.reports.run())
         while len(approach.port.of("OBSTACLE_DISTANCE")) < 3:
             await asyncio.sleep(0.01)

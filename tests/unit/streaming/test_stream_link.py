@@ -121,6 +121,7 @@ def test_a_viewer_that_connects_again_is_not_sent_the_map_again() -> None:
     assert exporter.report()["skipped"] == before  # nobody looks on
 
 
+@pytest.mark.real_time
 def test_a_viewer_that_stands_still_costs_the_others_nothing_and_catches_up() -> None:
     with serving(filled(200)) as (exporter, port), watching(port) as slow, watching(port) as quick:
         slow.may_take.clear()
@@ -165,6 +166,7 @@ def test_datagrams_go_to_nobody_who_is_not_connected() -> None:
                 stranger.recv(100)
 
 
+@pytest.mark.real_time
 def test_the_budget_holds_headers_and_all() -> None:
     with serving(filled(100), budget_kbit_s=800) as (_, port), watching(port) as viewer:
         until(lambda: viewer.link.n_bytes > 20_000)

@@ -65,6 +65,7 @@ def flight(folder: Path, after_ms: list[int]) -> Path:
     return folder
 
 
+@pytest.mark.real_time
 def test_a_flight_comes_in_the_time_it_was_taken(tmp_path: Path) -> None:
     after_ms = [0, 30, 60, 150, 180]
     camera = camera_source(CameraConfig(source="file", path=str(flight(tmp_path, after_ms))))
@@ -82,6 +83,7 @@ def test_a_flight_comes_in_the_time_it_was_taken(tmp_path: Path) -> None:
     assert camera.n_dropped == 0
 
 
+@pytest.mark.real_time
 def test_late_pictures_are_left_out_and_counted(tmp_path: Path) -> None:
     camera = camera_source(
         CameraConfig(source="file", path=str(flight(tmp_path, list(range(0, 400, 20)))))
@@ -96,6 +98,7 @@ def test_late_pictures_are_left_out_and_counted(tmp_path: Path) -> None:
     assert camera.n_dropped == n_between
 
 
+@pytest.mark.real_time
 def test_it_begins_again_and_time_goes_on(tmp_path: Path) -> None:
     folder = flight(tmp_path, [0, 20, 40])
     camera = camera_source(CameraConfig(source="file", path=str(folder), repeat=True))
@@ -107,6 +110,7 @@ def test_it_begins_again_and_time_goes_on(tmp_path: Path) -> None:
     assert np.all(steps >= 19.9)
 
 
+@pytest.mark.real_time
 def test_it_can_begin_at_a_set_time(tmp_path: Path) -> None:
     at_s = time.time() + 0.2
     config = CameraConfig(source="file", path=str(flight(tmp_path, [0, 20])), starts_at_unix_s=at_s)

@@ -88,6 +88,7 @@ def test_h264_by_rtsp(port: int, transport: str) -> None:
         assert np.abs(before.grey.astype(int) - after.grey).mean() > 2
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
 def test_stamps_tell_when_pictures_were_made(port: int, transport: str) -> None:
     source = camera(port, "live", transport=transport)
@@ -239,6 +240,7 @@ def test_no_such_protocol() -> None:
         NetworkCamera(CameraConfig(source="network", url="nonsense://u:p@cam/")).open()
 
 
+@pytest.mark.real_time
 def test_pictures_without_stamps_are_stamped_as_they_come() -> None:
     """JPEG over HTTP has none, and FFmpeg would make some up for 25 pictures a second."""
     with HttpCamera() as sender:

@@ -21,7 +21,7 @@ from drivers.camera.camera_source import Picture
 from drivers.camera.exposure_choice import Exposure, ExposureRange
 from drivers.camera.v4l2_camera import V4l2Camera
 from tests.support.cameras.fake_v4l2 import MONOTONIC_EOF, N_BUFFERS, FakeV4l2, install
-from tests.support.processes.strain import Strain
+from tests.support.processes.strain import within
 from tests.support.waiting import until
 
 
@@ -99,8 +99,9 @@ def test_invalid_stamps_are_replaced_and_reported(
         webcam.flags = 0
     else:
         webcam.lag_ns = 3_600_000_000_000
+    begun_ns = time.monotonic_ns()
     camera.open()
-    assert abs(first(camera).monotonic_ns - time.monotonic_ns()) < 100_000_000
+    assert begun_ns <= first(camera).monotonic_ns <= time.monotonic_ns()
     first(camera)
     assert len(camera.remarks) == 1
     assert "stamped when read" in camera.remarks[0]
@@ -276,13 +277,10 @@ def test_unplugged_and_back_under_another_number(webcam: FakeV4l2) -> None:
         assert came.wait(60)
         webcam.pull_out()
         until(lambda: feed.health.state == "missing")
-        with Strain() as strain:
+        with within(1.0):
             webcam.plug_in(3)
             came.clear()
-            plugged_in_ns = time.monotonic_ns()
             assert came.wait(60)
-            took_s = 1e-9 * (time.monotonic_ns() - plugged_in_ns)
-            assert took_s < strain.allowed_s(1.0, plugged_in_ns)
         assert feed.health.state == "running"
         assert feed.health.n_reopened == 1
     finally:

@@ -24,6 +24,7 @@ from tests.support.autopilot.mavlink_link import (
     running,
     unknown,
 )
+from tests.support.waiting import PATIENCE_S
 from tests.support.waiting_in_loop import until
 
 HOST = "127.0.0.1"
@@ -42,7 +43,7 @@ async def test_an_autopilot_on_any_wire(tmp_path: Path, kind: str) -> None:
                 await until(lambda: port.n_received > 0)
             port.send(heartbeat())
             await until(lambda: bool(heard.of("HEARTBEAT")) and len(heard.of("ATTITUDE")) > 5)
-            autopilot.wait_for("HEARTBEAT", 1)
+            autopilot.wait_for("HEARTBEAT", 1, PATIENCE_S)
             message = autopilot.of("HEARTBEAT")[0]
             assert (message.system, message.component) == (1, 197)
             assert port.n_bad == 0
@@ -226,7 +227,7 @@ async def test_signed_both_ways(key_file: str) -> None:
             for i in range(5):
                 port.send(attitude(i))
             await until(lambda: len(heard.messages) > 10)
-            autopilot.wait_for("ATTITUDE", 5)
+            autopilot.wait_for("ATTITUDE", 5, PATIENCE_S)
             assert autopilot.n_bad == 0
             assert (port.n_unsigned, port.n_bad) == (0, 0)
 

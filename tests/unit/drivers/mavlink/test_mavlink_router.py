@@ -296,6 +296,7 @@ def flood(client: Side, speaker: Speaker) -> Callable[[], None]:
     return more
 
 
+@pytest.mark.real_time
 async def test_clients_that_flood_starve_neither_us_nor_another(tmp_path: Path) -> None:
     """Over a slow line: clients have to share what we leave of it."""
     cable = PtyWire(tmp_path / "autopilot")
@@ -330,18 +331,20 @@ async def test_clients_that_flood_starve_neither_us_nor_another(tmp_path: Path) 
             await asyncio.sleep(0.1)
             for data in cable.receive():
                 got += stream.feed(data, 0)
+            read_s = time.monotonic() - begun_s
             sources = [packet.system for packet in got]
             assert sources.count(1) == n_said  # all of ours
             assert sources.count(255) >= n_said - 4  # and the other client's
             for flooder in (200, 201):
                 assert sources.count(flooder) > 5
             n_bytes = sum(len(packet.raw) for packet in got)
-            assert n_bytes < 5760 * (passed_s + 0.25)
+            assert n_bytes < 5760 * (read_s + 0.15)
             assert port.n_dropped == 0
             assert stream.n_bad_bytes == 0
     cable.unplug()
 
 
+@pytest.mark.real_time
 async def test_a_thousand_connections_leave_nothing_behind() -> None:
     async with flown() as scene:
         good = await scene.tcp_client()

@@ -25,6 +25,7 @@ from companion.health import (
 )
 from drivers.system import metrics, short_answers
 from drivers.system.metrics import Metrics
+from tests.support.waiting import PATIENCE_S
 
 HEALTH = Health(
     1,
@@ -62,7 +63,7 @@ async def served(
 
 
 def get(port: int, path: str = "/metrics") -> str:
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=2) as reply:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=PATIENCE_S) as reply:
         text: str = reply.read().decode()
     return text
 

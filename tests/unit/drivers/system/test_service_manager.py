@@ -14,6 +14,7 @@ import pytest
 
 from drivers.system.service_manager import ServiceManager
 from drivers.system.status_socket import SERVICE_FOLDER
+from tests.support.waiting import PATIENCE_S
 
 UNIT = Path(__file__).parents[4] / "systemd/companion.service"
 
@@ -65,6 +66,7 @@ def test_reloading_bears_the_monotonic_time(listener: tuple[str, socket.socket])
     manager.close()
 
 
+@pytest.mark.real_time
 def test_a_manager_that_does_not_read_neither_blocks_nor_raises(
     listener: tuple[str, socket.socket],
 ) -> None:
@@ -119,7 +121,7 @@ def test_systemd_has_nothing_to_say_against_the_unit(tmp_path: Path) -> None:
     text = UNIT.read_text("utf-8")
     unit.write_text(text.replace("/opt/companion/bin/companion run", "/bin/true run"))
     verified = subprocess.run(
-        ["systemd-analyze", "verify", str(unit)], capture_output=True, text=True, timeout=20
+        ["systemd-analyze", "verify", str(unit)], capture_output=True, text=True, timeout=PATIENCE_S
     )
     assert (verified.returncode, verified.stderr.strip()) == (0, "")
 
@@ -128,7 +130,7 @@ def test_systemd_has_nothing_to_say_against_the_unit(tmp_path: Path) -> None:
 def test_it_may_do_little() -> None:
     rated = subprocess.run(
         ["systemd-analyze", "security", "--no-pager", "--offline=true", str(UNIT)],
-        capture_output=True, text=True, timeout=20, check=False,
+        capture_output=True, text=True, timeout=PATIENCE_S, check=False,
     )  # fmt: skip
     if "unrecognized option" in rated.stderr:
         pytest.skip("this systemd rates no units that are not installed")

@@ -33,6 +33,7 @@ from drivers.system.status_socket import (
     own_socket_path,
 )
 from tests.support.processes.closed_pipe import into_closed_pipe
+from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[4]
 HEALTH = Health(
@@ -64,7 +65,7 @@ async def served(
 
 
 def run(test: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    asyncio.run(asyncio.wait_for(test(), 10))
+    asyncio.run(asyncio.wait_for(test(), PATIENCE_S))
 
 
 async def ask(path: Path) -> dict[str, Any]:
