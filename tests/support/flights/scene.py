@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 
@@ -30,14 +32,21 @@ def leaves(rng: np.random.Generator, size: int = 1024) -> Bytes:
     out = np.full((size, size), 128, np.uint8)
     n = size * size // 40
     radii = 2.5 * rng.uniform(0.0025, 1.0, n) ** -0.5  # as many of each size as fit
-    for radius in np.sort(radii)[::-1]:
-        angles = np.sort(rng.uniform(0, 2 * np.pi, 5))
-        outline = radius * np.stack([np.cos(angles), np.sin(angles)], 1)
-        centre, grey = rng.uniform(0, size, 2), int(np.clip(rng.normal(128, 45), 10, 245))
-        near = {(0, 0), *((int(s), int(t)) for s in _over(centre[0], radius, size)
-                          for t in _over(centre[1], radius, size))}  # fmt: skip
-        for shift in near:
-            corners = (16 * (centre + outline + np.array(shift))).astype(np.int32)
+    radii = np.sort(radii)[::-1]
+    draws = [
+        (rng.uniform(0, 2 * np.pi, 5), rng.uniform(0, size, 2), rng.normal(128, 45))
+        for _ in range(n)
+    ]
+    angles, centres, greys = (np.array(each) for each in zip(*draws, strict=True))
+    angles = np.sort(angles, axis=1)
+    outlines = radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], 2)
+    outlines += centres[:, None]
+    tones = np.clip(greys, 10, 245).astype(int)
+    for outline, (x, y), radius, grey in zip(
+        outlines, centres.tolist(), radii.tolist(), tones.tolist(), strict=True
+    ):
+        for shift in itertools.product(_over(x, radius, size), _over(y, radius, size)):
+            corners = (16 * (outline + shift)).astype(np.int32)
             cv2.fillPoly(out, [corners], (grey,), cv2.LINE_AA, 4)
     return out
 
