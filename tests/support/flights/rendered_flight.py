@@ -113,11 +113,15 @@ class Terrain:
                 away = np.float32(height - centre[2]) / down
                 n, e = centre[0] + away * north, centre[1] + away * east
                 hit = (away > 0.1) & (away < 1e3) & (n > n0) & (n < n1) & (e > e0) & (e < e1)
-                if not hit.any():
+                rows, columns = np.flatnonzero(hit.any(1)), np.flatnonzero(hit.any(0))
+                if not len(rows):
                     continue
-                seen, size = whole[part], len(pattern)
+                box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+                hit, seen, size = hit[box], whole[part][box], len(pattern)
                 column, row = (
-                    np.where(hit, np.mod(v / self._metres_per_texel, size), -1.0).astype(np.float32)
+                    np.where(hit, np.mod(v[box] / self._metres_per_texel, size), -1.0).astype(
+                        np.float32
+                    )
                     for v in (e, n)
                 )
                 drawn = cv2.remap(
