@@ -29,7 +29,7 @@ OF_WARNING = {
 
 
 class SetupProof:
-    """What has been proven of the camera of now. Used in the event loop.
+    """Parts proven of the camera of now, and words to the pilot about the others. Used in the event loop.
 
     `tell` takes what the pilot reads, `failed` why it cannot be kept (in another thread). Without
     gyroscopes a lens cannot be proven, and of a camera on a gimbal nothing: it is not asked for.
@@ -91,7 +91,7 @@ def _identity_of(camera: Camera) -> str:
 
 
 def _kept(path: Path, identity: str) -> set[str]:
-    """What was proven of this camera before; nothing where that is not known."""
+    """Parts proven of this camera before; none where that is not known."""
     try:
         kept = json.loads(path.read_bytes())
         return set(kept["proven"]) if identity and kept["camera"] == identity else set()
