@@ -29,10 +29,11 @@ OF_WARNING = {
 
 
 class SetupProof:
-    """Parts proven of the camera of now, and words to the pilot about the others. Used in the event loop.
+    """Parts proven of the camera of now, and words to the pilot about the others.
 
-    `tell` takes what the pilot reads, `failed` why it cannot be kept (in another thread). Without
-    gyroscopes a lens cannot be proven, and of a camera on a gimbal nothing: it is not asked for.
+    Used in the event loop. `tell` takes what the pilot reads, `failed` why it cannot be kept (in
+    another thread). Without gyroscopes no lens can be proven, and of a camera on a gimbal nothing:
+    that is not asked for.
     """
 
     def __init__(
