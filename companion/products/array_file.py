@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 import os
 import tempfile
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,8 @@ class ArrayFile:
         self._begin = self._at = self._end = 0
         """Begin of the newest segment in the file, the next array in it, and its length."""
         self._n_put = 0
+        self._lock = threading.Lock()
+        """Tracking and mapping put arrays there, each in a thread of its own."""
         self.n_bytes = 0
         self.fault = ""
 
@@ -42,14 +45,15 @@ class ArrayFile:
         """Equal arrays, read-only, that lie in the file; None where the disk takes no more."""
         if self.fault:
             return None
-        try:
-            kept = self._put([np.ascontiguousarray(each) for each in arrays])
-        except OSError as error:
-            self.fault = f"{self._folder}: {error.strerror or error}"
-            return None
-        self._n_put += 1
-        if self._n_put % FORGOTTEN_AFTER == 0:
-            self.forget()
+        with self._lock:
+            try:
+                kept = self._put([np.ascontiguousarray(each) for each in arrays])
+            except OSError as error:
+                self.fault = f"{self._folder}: {error.strerror or error}"
+                return None
+            self._n_put += 1
+            if self._n_put % FORGOTTEN_AFTER == 0:
+                self.forget()
         return kept
 
     def forget(self) -> None:

@@ -27,12 +27,11 @@ from companion.messages import (
 from companion.products.array_file import ArrayFile
 from companion.products.site_map_file import (
     SITE_MAP,
-    SiteMapError,
-    digest_of,
     map_path,
     read_site_map,
     write_site_map,
 )
+from companion.products.site_map_tables import SiteMapError
 from companion.runtime.stage_protocol import Finish, KeepMap, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 from companion.slam.compiled.compiling import cache_errors, shipped
@@ -92,7 +91,7 @@ class _Localisation(Work):
             return None
         path = map_path(setup.config.map.use).absolute()
         try:
-            read, digest = read_site_map(path, self._far), digest_of(path)
+            read = read_site_map(path, self._far)
             features = setup.config.features
             if (read.site.scale_factor, read.site.n_levels) != (
                 features.scale_factor, features.n_levels,
@@ -110,10 +109,10 @@ class _Localisation(Work):
             self._said.append((MAP_NOT_USED, str(error)))
             return None
         if setup.is_live:
-            self._site_used = SiteMapUsed(0, str(path), read.site.revision, digest)
+            self._site_used = SiteMapUsed(0, str(path), read.site.revision, read.digest)
         if read.damaged:
             self._said.append((MAP_DAMAGED, f"{len(read.damaged)} parts are left out"))
-        return SiteUse(read.site, setup.camera, setup.origin, setup.is_live)
+        return SiteUse(read.site, setup.camera, setup.origin, setup.is_live, read.places)
 
     def step(self, message: Any) -> Iterable[Message]:
         if isinstance(message, SetLoadLevel):

@@ -41,7 +41,7 @@ from companion.messages import (
     Warned,
 )
 from companion.products.atomic_file import write_atomically
-from companion.products.site_map_file import digest_of, map_path, read_head, read_site_map
+from companion.products.site_map_file import map_path, read_site_map
 from companion.timing.clock import StageTimes
 from drivers.recording.decisions import Decisions, decisions_of
 from drivers.recording.flights_folder import RECORDING
@@ -162,13 +162,14 @@ def _site_of(told: Decisions, config: Config, camera: Camera) -> SiteUse | None:
             f"{path}: the flight used this map of an earlier flight, revision {used.revision}, and "
             "it is not there; --map FILE names it where it is now"
         )
-    if digest_of(path) != used.digest:
+    read = read_site_map(path)
+    if read.digest != used.digest:
         raise FlightError(
             f"{path}: the flight used another map of an earlier flight: this one has revision "
-            f"{read_head(path).revision}, that had {used.revision} and the digest {used.digest}; "
+            f"{read.site.revision}, that had {used.revision} and the digest {used.digest}; "
             "--map FILE names it where it is now"
         )
-    return SiteUse(read_site_map(path).site, camera, origin=None, is_live=True)
+    return SiteUse(read.site, camera, origin=None, is_live=True)
 
 
 def _made_again(told: Decisions, tracked: Tracked) -> Payloads:

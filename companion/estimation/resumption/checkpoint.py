@@ -25,6 +25,7 @@ from companion.messages import Georeference
 from companion.slam.features.orb_features import features_of
 from companion.slam.map.map_part import MapPart
 from companion.slam.map.map_points import PointArrays
+from companion.slam.map.seen import Seen
 from companion.slam.map.sparse_map import Keyframe
 
 MAGIC = b"COMPMAP\x01"
@@ -200,9 +201,12 @@ def _keyframes(
             arrays["angles_deg"][own], arrays["descriptors"][own],
         )  # fmt: skip
         out.append(Keyframe(
-            keyframe_id, seq, t_ns, Pose.from_matrix(arrays["camera_from_map"][n]), features,
-            point_ids[own], arrays["normalised"][own].astype(np.float64),
-            arrays["whitening"][own].astype(np.float64), refined_for[own],
+            keyframe_id, seq, t_ns, Pose.from_matrix(arrays["camera_from_map"][n]),
+            Seen(
+                features, arrays["normalised"][own].astype(np.float64),
+                arrays["whitening"][own].astype(np.float64),
+            ),
+            point_ids[own], refined_for[own],
             ned_from_camera=None if np.isnan(attitude).any() else attitude,
         ))  # fmt: skip
     return tuple(out)

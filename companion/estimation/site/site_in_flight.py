@@ -33,7 +33,7 @@ class SiteInFlight:
         self._place: tuple[int, Array] | None = None
         """Place of the camera, NED metres, that is to be compared."""
         if use is not None:
-            tracker.use_site(use.slam_map)
+            tracker.use_site(use.slam_map, use.places)
             tracker.atlas.on_merge = self._merged
             georeferences.hold(use.slam_map, use.georeference)
 

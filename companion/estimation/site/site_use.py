@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned, ned_from_ge
 from companion.geometry.transforms import Array, Similarity
 from companion.messages import Georeference, Warned
 from companion.slam.loop.loop_closure import LoopClosure
+from companion.slam.loop.place_recognition import PlaceBlock
 from companion.slam.map.site_map import SiteAccount, SiteMap, slam_map_of
 from companion.slam.map.sparse_map import SlamMap
 
@@ -39,11 +41,14 @@ class SiteUse:
     """
 
     def __init__(
-        self, site: SiteMap, camera: Camera, origin: GeoOrigin | None, is_live: bool = False
-    ) -> None:
+        self, site: SiteMap, camera: Camera, origin: GeoOrigin | None, is_live: bool = False,
+        places: Sequence[PlaceBlock] = (),
+    ) -> None:  # fmt: skip
         self.site = site.account
         """Keyframes and points are in `slam_map`, and grow old in it."""
         self.slam_map: SlamMap = slam_map_of(site, camera)
+        self.places = places
+        """Index of its keyframes, none where it has to be made."""
         self.located = self.misplaced = False
         self._n_off = self._n_scale_off = 0
         self._measured: Scale | None = None

@@ -6,14 +6,16 @@ each of several tables; keyframes that share rare words are similar, as with a b
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 
 from companion.geometry.transforms import Array
 from companion.messages import Bytes
 from companion.slam.compiled.word_matching import (
+    Marks,
     Rows,
     Words,
     entries_of,
@@ -28,6 +30,8 @@ from companion.slam.features.orb_features import Ints
 N_TABLES = 8
 N_BITS = 18
 N_WORDS = N_TABLES << N_BITS
+PLACES_VERSION = 1
+"""Of the words of descriptors and the layout of a block, where these are kept."""
 BLOCK, MERGED = 32, 7
 """Keyframes whose words are sorted together while more come; so many such blocks become one, as
 looking for words takes about as long in a block of any size. A byte names the keyframes of one."""
@@ -45,6 +49,25 @@ def _distinct(words: Words) -> Words:
     return words[np.r_[True, words[1:] != words[:-1]]] if len(words) else words
 
 
+class PlaceBlock(NamedTuple):
+    """Words of some keyframes as `marked`, with the index in `keys` (K,) of who has each."""
+
+    keys: Rows
+    owners: Bytes
+    marks: Marks
+    begins: Words
+
+
+def place_blocks(keyframes: Iterable[tuple[int, Bytes]]) -> Iterator[PlaceBlock]:
+    """Blocks of keyframes, each a key and descriptors (N, 32), for `add_blocks`."""
+    left = iter(keyframes)
+    while some := list(islice(left, MERGED * BLOCK)):
+        words = [words_of_bits(each, _CHOSEN) << 8 | n for n, (_, each) in enumerate(some)]
+        block = _Block.merged(np.zeros(0, np.int32), np.concatenate(words, dtype=np.uint32))
+        keys = np.array([key for key, _ in some], np.int32)
+        yield PlaceBlock(keys, block.owners, block.marks, block.begins)
+
+
 class _Block:
     """Words of some keyframes in order, and which of `rows` has each, by its index there.
 
@@ -56,7 +79,7 @@ class _Block:
         self.rows, self.is_merged = rows, is_merged
         self.owners: Bytes = np.zeros(0, np.uint8)
         self._words: Words = np.zeros(0, np.uint32)
-        self._marks, self._begins = np.zeros(0, np.uint64), np.zeros(0, np.uint32)
+        self.marks, self.begins = np.zeros(0, np.uint64), np.zeros(0, np.uint32)
 
     @classmethod
     def merged(cls, rows: Rows, entries: Words) -> _Block:
@@ -72,19 +95,19 @@ class _Block:
 
     @property
     def words(self) -> Words:
-        return entries_of(self._marks) if self.is_merged else self._words
+        return entries_of(self.marks) if self.is_merged else self._words
 
     def put(self, words: Words, owners: Bytes) -> None:
         self.owners = owners
         if self.is_merged:
-            self._marks, self._begins = marked(words, N_WORDS)
+            self.marks, self.begins = marked(words, N_WORDS)
         else:
             self._words = words
 
     def spans(self, words: Words) -> tuple[Ints, Ints]:
         if not self.is_merged:
             return equal_spans(self._words, words)
-        return marked_spans(self._marks, self._begins, words)
+        return marked_spans(self.marks, self.begins, words)
 
 
 class KeyframeDatabase:
@@ -126,13 +149,16 @@ class KeyframeDatabase:
 
     def add_all(self, keyframes: Iterable[tuple[int, Bytes]]) -> None:
         """Add many keyframes, each a key and descriptors (N, 32): faster than one by one."""
-        left = iter(keyframes)
-        while some := list(islice(left, MERGED * BLOCK)):
-            rows = np.arange(len(some), dtype=np.int32) + np.int32(len(self._keys))
-            words = [words_of_bits(each, _CHOSEN) << 8 | n for n, (_, each) in enumerate(some)]
-            block = _Block.merged(rows, np.concatenate(words, dtype=np.uint32))
-            self._keys += [key for key, _ in some]
-            self._block_of += [block] * len(some)
+        self.add_blocks(place_blocks(keyframes))
+
+    def add_blocks(self, blocks: Iterable[PlaceBlock]) -> None:
+        """Add the keyframes of blocks."""
+        for each in blocks:
+            rows = np.arange(len(each.keys), dtype=np.int32) + np.int32(len(self._keys))
+            block = _Block(rows, is_merged=True)
+            block.owners, block.marks, block.begins = each[1:]
+            self._keys += each.keys.tolist()
+            self._block_of += [block] * len(rows)
             self._blocks.append(block)
 
     def _merge(self) -> None:

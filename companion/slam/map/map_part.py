@@ -50,7 +50,7 @@ def part_around(slam_map: SlamMap, keyframe: Keyframe, most_bytes: int) -> MapPa
         near = slam_map.keyframes[key]
         _, ids = slam_map.observations_of(near)
         n_new = int(np.count_nonzero(~wanted[ids]))
-        left -= FEATURE_BYTES * len(near.features) + POINT_BYTES * n_new
+        left -= FEATURE_BYTES * len(near.point_ids) + POINT_BYTES * n_new
         if left < 0:
             break
         chosen[key] = near
@@ -73,8 +73,7 @@ def part_of(slam_map: SlamMap, chosen: Mapping[int, Keyframe]) -> MapPart:
         replace(
             k, point_ids=index[k.point_ids],
             refined_for=np.where(k.refined_for == k.point_ids, index[k.point_ids], -1),
-            normalised=k.normalised if k.is_far else k.normalised.copy(),
-            whitening=k.whitening if k.is_far else k.whitening.copy(), grey=None, is_far=False,
+            seen=k.seen_apart, grey=None, is_far=False,
         )
         for _, k in sorted(chosen.items())
     )  # fmt: skip

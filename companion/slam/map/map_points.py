@@ -11,7 +11,7 @@ from companion.geometry.transforms import Array, Similarity
 from companion.messages import Bytes
 from companion.slam.features.orb_features import Bools, Features, Ints
 from companion.slam.features.patches import Patches, cut, level_of
-from companion.slam.map.patch_store import NO_PATCH, PatchStore
+from companion.slam.map.patch_store import NO_PATCH, PatchRows, PatchStore
 
 N_OBSERVERS_KEPT = 8
 ARRAYS = (
@@ -35,7 +35,7 @@ class PointArrays(NamedTuple):
     first_unproject: Array
     patch_centre: Array
     patch_level: Ints
-    patch_grey: Bytes
+    patch_grey: PatchRows
 
 
 @dataclass(slots=True, eq=False)
@@ -164,7 +164,7 @@ class MapPoints:
         if is_far:
             self.patch_at[every] = self.patches.put_away(np.full(n, NO_PATCH), points.patch_grey)
         else:
-            self.patch_at[every] = self.patches.add(points.patch_grey)
+            self.patch_at[every] = self.patches.add(points.patch_grey[every])
 
     def points_of(self, ids: Ints) -> PointArrays:
         """Copies of the data of living points, without their observations."""

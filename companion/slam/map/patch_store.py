@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,6 +16,35 @@ NO_PATCH = -1
 LEAST_ROWS = 4096
 
 
+class PatchRows(Protocol):
+    """Patches (N, 24, 24) u8 by row."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, at: Any, /) -> Any: ...
+
+
+class PatchesLater:
+    """N patches that nothing changes, in blocks: `read` is called with the first row of each."""
+
+    def __init__(self, n: int, block: int, read: Callable[[int], Bytes]) -> None:
+        self._n, self._block, self._read = n, block, read
+        self._blocks: dict[int, Bytes] = {}
+
+    def __len__(self) -> int:
+        return self._n
+
+    def __getitem__(self, at: Ints) -> Bytes:
+        out = np.empty((len(at), STORED, STORED), np.uint8)
+        firsts = at - at % self._block
+        for first in np.unique(firsts).tolist():
+            if first not in self._blocks:
+                self._blocks[first] = self._read(first)
+            own = firsts == first
+            out[own] = self._blocks[first][at[own] - first]
+        return out
+
+
 @dataclass(slots=True, eq=False)
 class PatchStore:
     """Patches (24, 24) u8 by number: from 0 in `near`, below NO_PATCH in arrays put away."""
@@ -21,7 +52,7 @@ class PatchStore:
     near: Bytes = field(default_factory=lambda: np.zeros((1, STORED, STORED), np.uint8))
     """The last row is looked at for NO_PATCH."""
     _free: list[int] = field(default_factory=list)
-    _far: list[Bytes] = field(default_factory=list)
+    _far: list[PatchRows] = field(default_factory=list)
     _far_begins: list[int] = field(default_factory=lambda: [0])
     """Number of patches before each array of `_far`, and of all."""
 
@@ -65,13 +96,13 @@ class PatchStore:
             self._keep_far(grey)
         return out
 
-    def put_away(self, numbers: Ints, grey: Bytes) -> Ints:
+    def put_away(self, numbers: Ints, grey: PatchRows) -> Ints:
         """Free the rows of near patches, which are in an array `grey` from now on; new numbers."""
         self.free(numbers)
         first = self._keep_far(grey)
         return NO_PATCH - 1 - np.arange(first, first + len(grey))
 
-    def _keep_far(self, grey: Bytes) -> int:
+    def _keep_far(self, grey: PatchRows) -> int:
         """Keep an array of far patches; the number of those before it."""
         first = self._far_begins[-1]
         self._far.append(grey)

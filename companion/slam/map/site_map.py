@@ -15,9 +15,10 @@ from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Floats
-from companion.slam.features.orb_features import Features, Ints
+from companion.slam.features.orb_features import Ints
 from companion.slam.map.map_part import MapPart, map_of, part_of
 from companion.slam.map.map_points import PointArrays
+from companion.slam.map.seen import Seen, SeenLater
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 
 EARLIER_NS = 4_000_000_000_000_000_000
@@ -145,11 +146,8 @@ def slam_map_of(site: SiteMap, camera: Camera) -> SlamMap:
     earlier = tuple(
         replace(
             k, ned_from_camera=None,
-            normalised=k.normalised if k.is_far else k.normalised.copy(),
-            whitening=k.whitening if k.is_far else k.whitening.copy(),
             refined_for=k.refined_for if k.is_far else k.refined_for.copy(),
-            # of a file's, pixels are derived from directions
-            features=k.features if k.is_far and is_same[part] else _seen_by(camera, k),
+            seen=k.seen_apart if k.is_far and is_same[part] else _seen_by(camera, k),
         )
         for k, part in zip(site.keyframes, site.part_of.tolist(), strict=True)
     )  # fmt: skip
@@ -165,11 +163,15 @@ def slam_map_of(site: SiteMap, camera: Camera) -> SlamMap:
     return slam_map
 
 
-def _seen_by(camera: Camera, keyframe: Keyframe) -> Features:
-    """Features as a camera sees them; where that is the same one, as they are."""
-    pixels = pixels_of(camera, keyframe.normalised)
-    same = np.array_equal(pixels, keyframe.features.pixels)
-    return keyframe.features if same else replace(keyframe.features, pixels=pixels)
+def _seen_by(camera: Camera, keyframe: Keyframe) -> Seen | SeenLater:
+    """What a keyframe saw, at the pixels where a camera sees it."""
+    seen = keyframe.seen_apart
+
+    def read() -> Seen:
+        pixels = pixels_of(camera, seen.normalised)
+        return Seen(replace(seen.features, pixels=pixels), seen.normalised, seen.whitening)
+
+    return SeenLater(read) if keyframe.is_far else read()
 
 
 def of_this_flight(part: MapPart) -> MapPart | None:

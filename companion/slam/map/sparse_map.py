@@ -17,6 +17,7 @@ from companion.slam.compiled.observing import observed
 from companion.slam.features.orb_features import Features, Ints
 from companion.slam.map.keyframe_places import KeyframePlaces
 from companion.slam.map.map_points import N_OBSERVERS_KEPT, MapPoints
+from companion.slam.map.seen import Seen, SeenLater
 
 ID_QUARANTINE_KEYFRAMES = 40
 """Keyframes for which the id of a removed point is not recycled, at least."""
@@ -33,11 +34,8 @@ class Keyframe:
     seq: int
     t_ns: int
     camera_from_map: Pose
-    features: Features
+    seen: Seen | SeenLater
     point_ids: Ints
-    normalised: Array
-    whitening: Array
-    """(N, 2), (N, 2, 2) as those of the features, refined where patch alignment succeeded."""
     refined_for: Ints
     """Point (N,) whose patch refined each feature, -1 where none did."""
     grey: Bytes | None = None
@@ -45,7 +43,27 @@ class Keyframe:
     ned_from_camera: Array | None = None
     """Attitude (3, 3) by the autopilot, where measured."""
     is_far: bool = False
-    """Left behind: features, their refinement and the patches of its points may lie in a file."""
+    """Left behind: what it saw, and the patches of its points, may lie in a file."""
+
+    @property
+    def features(self) -> Features:
+        """Features as they were found."""
+        return self.seen.features
+
+    @property
+    def normalised(self) -> Array:
+        """Ideal coordinates (N, 2), refined where patch alignment succeeded."""
+        return self.seen.normalised
+
+    @property
+    def whitening(self) -> Array:
+        """Whitening (N, 2, 2) of `normalised`."""
+        return self.seen.whitening
+
+    @property
+    def seen_apart(self) -> Seen | SeenLater:
+        """What it saw, for a copy that may be changed: of one left behind that is never."""
+        return self.seen if isinstance(self.seen, SeenLater) or self.is_far else self.seen.copied()
 
     @property
     def centre(self) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from companion.messages import LoopClosed
 from companion.slam.features.orb_features import Features
 from companion.slam.loop.loop_closure import LoopClosure, LoopDetector
 from companion.slam.loop.map_merge import close_loop, loop_graph, merge_maps
-from companion.slam.loop.place_recognition import KeyframeDatabase
+from companion.slam.loop.place_recognition import KeyframeDatabase, PlaceBlock, place_blocks
 from companion.slam.loop.relocalizer import (
     MIN_FOUND_RATIO,
     Relocalised,
@@ -65,6 +65,7 @@ class Atlas:
         self.site: SlamMap | None = None
         """Map of an earlier flight, until the active one is found in it."""
         self._site_finder = LoopDetector(KeyframeDatabase(), self._relocalizer)
+        self._site_places: Sequence[PlaceBlock] = ()
         self.on_merge: Callable[[SlamMap, SlamMap, Similarity], None] = lambda here, there, by: None
         """Called when `here` takes over `there`; `by` is here_from_there."""
         self.segments: list[SlamMap] = []
@@ -115,10 +116,16 @@ class Atlas:
         for keyframe in kept.keyframes.values():
             self.index_keyframe(keyframe)
 
-    def use_site(self, site: SlamMap) -> None:
-        """Look for the active map in that of an earlier flight, until it is found there."""
+    def use_site(self, site: SlamMap, places: Sequence[PlaceBlock] = ()) -> None:
+        """Look for the active map in that of an earlier flight, until it is found there.
+
+        `places` indexes its keyframes; without, they are all read.
+        """
+        self._site_places = places or list(
+            place_blocks((key, k.features.descriptors) for key, k in site.keyframes.items())
+        )
         database = KeyframeDatabase()
-        database.add_all((key, k.features.descriptors) for key, k in site.keyframes.items())
+        database.add_blocks(self._site_places)
         self.site, self._site_finder = site, LoopDetector(database, self._relocalizer)
 
     def drop_map(self, first_keyframe_id: int) -> bool:
@@ -276,11 +283,10 @@ class Atlas:
     def _take_over_site(self, segment: SlamMap, mapper: Mapper) -> None:
         """Know the map of an earlier flight as part of the active one."""
         self.site = None
+        self._database.add_blocks(self._site_places)
         for key, keyframe in list(segment.keyframes.items()):
-            self._map_lock.yield_to_tracking()
-            if key in segment.held:
-                self.index_keyframe(keyframe)
-            else:
+            if key not in segment.held:
+                self._map_lock.yield_to_tracking()
                 mapper.fusion.fuse_held(keyframe)
 
     def adjust_pending(self, yield_point: Callable[[], None]) -> None:

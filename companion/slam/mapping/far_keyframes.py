@@ -7,14 +7,15 @@ lies, so that no result depends on it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import islice
 from typing import Any, Protocol
 
 import numpy as np
 
+from companion.slam.features.orb_features import Features
 from companion.slam.map.patch_store import NO_PATCH
-from companion.slam.map.sparse_map import Keyframe, SlamMap
+from companion.slam.map.seen import Seen, SeenLater
+from companion.slam.map.sparse_map import SlamMap
 from companion.slam.mapping.mapping_worker import MapLock
 
 N_NEAR = 400
@@ -34,24 +35,20 @@ class ArrayFile(Protocol):
         """Equal arrays, which are read from the file as they are used; None where it is full."""
 
 
-def put_away(keyframe: Keyframe, file: ArrayFile) -> None:
-    """Keep the features of a keyframe that nothing changes any more in a file, if it takes them."""
-    kept = file.put(_arrays_of(keyframe))
-    if kept is not None:
-        _replace_arrays(keyframe, kept)
-        keyframe.is_far = True
+def put_away(seen: Seen, file: ArrayFile) -> Seen:
+    """What a keyframe saw that nothing changes any more, from a file, if that takes it."""
+    kept = file.put(_arrays_of(seen))
+    return seen if kept is None else _seen_of(kept)
 
 
-def _arrays_of(keyframe: Keyframe) -> list[Any]:
-    features = (getattr(keyframe.features, name) for name in OF_FEATURES)
-    return [*features, keyframe.normalised, keyframe.whitening, keyframe.refined_for]
+def _arrays_of(seen: Seen | SeenLater) -> list[Any]:
+    features = (getattr(seen.features, name) for name in OF_FEATURES)
+    return [*features, seen.normalised, seen.whitening]
 
 
-def _replace_arrays(keyframe: Keyframe, kept: Sequence[Any]) -> None:
-    *of_features, keyframe.normalised, keyframe.whitening, keyframe.refined_for = kept
-    keyframe.features = replace(
-        keyframe.features, **dict(zip(OF_FEATURES, of_features, strict=True))
-    )
+def _seen_of(kept: Sequence[Any]) -> Seen:
+    *of_features, normalised, whitening = kept
+    return Seen(Features(*of_features), normalised, whitening)
 
 
 def leave_behind(slam_map: SlamMap, file: ArrayFile | None, map_lock: MapLock) -> None:
@@ -63,10 +60,12 @@ def leave_behind(slam_map: SlamMap, file: ArrayFile | None, map_lock: MapLock) -
         slam_map.leave_behind(keyframe)
         _, points = slam_map.observations_of(keyframe)
         points = np.unique(points[slam_map.patch_at[points] > NO_PATCH])
-        arrays = [*_arrays_of(keyframe), slam_map.patches_of(points).grey]
+        patches = slam_map.patches_of(points).grey
+        arrays = [*_arrays_of(keyframe.seen), keyframe.refined_for, patches]
         with map_lock.released():  # only mapping changes old keyframes and patches of their points
             kept = None if file is None else file.put(arrays)
         if kept is None:
             continue
-        _replace_arrays(keyframe, kept[:-1])
-        slam_map.put_patches_away(points, kept[-1])
+        *of_seen, keyframe.refined_for, patches = kept
+        keyframe.seen = _seen_of(of_seen)
+        slam_map.put_patches_away(points, patches)

@@ -8,6 +8,7 @@ import numpy as np
 
 from companion.slam.features.orb_features import Ints
 from companion.slam.features.view import View
+from companion.slam.map.seen import Seen
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 
 MIN_SHARE, MAX_PARALLAX_DEG, MAX_S = 0.75, 3.0, 3.0
@@ -74,10 +75,13 @@ def _parallax_deg(slam_map: SlamMap, reference: Keyframe, view: View) -> float:
 def keyframe_of(view: View, keyframe_id: int) -> Keyframe:
     """A keyframe from a view, without observations."""
     return Keyframe(
-        keyframe_id, view.seq, view.t_ns, view.camera_from_map, view.features,
+        keyframe_id, view.seq, view.t_ns, view.camera_from_map,
+        Seen(
+            view.features,
+            view.features.normalised.copy() if view.normalised is None else view.normalised,
+            view.features.whitening.copy() if view.whitening is None else view.whitening,
+        ),
         np.full(len(view.features), -1),
-        view.features.normalised.copy() if view.normalised is None else view.normalised,
-        view.features.whitening.copy() if view.whitening is None else view.whitening,
         np.full(len(view.features), -1) if view.refined_for is None else view.refined_for,
         view.grey, view.ned_from_camera,
     )  # fmt: skip

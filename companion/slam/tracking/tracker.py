@@ -6,7 +6,7 @@ Knows no clock: times come with the frames, durations are measured by the given 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from companion.slam.features.orb_features import FeatureExtractor, Features
 from companion.slam.features.view import View
 from companion.slam.initialisation.bootstrap import Bootstrap, TwoViewReconstruction
 from companion.slam.initialisation.map_continuation import MapContinuation, continuation_of
+from companion.slam.loop.place_recognition import PlaceBlock
 from companion.slam.map.reports import keyframe_added, track_of
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping.atlas import MAX_DISCARDED_KEYFRAMES, Atlas
@@ -152,9 +153,9 @@ class Tracker:
         self.keyframes.next_id = next_keyframe_id
         self.state, self._lost_since_ns = TrackState.LOST, until_ns
 
-    def use_site(self, site: SlamMap) -> None:
+    def use_site(self, site: SlamMap, places: Sequence[PlaceBlock]) -> None:
         """Look for the camera in the map of an earlier flight; before the first frame."""
-        self.atlas.use_site(site)
+        self.atlas.use_site(site, places)
         self.keyframes.next_id = max(site.keyframes) + 1
 
     def drop_map(self, first_keyframe_id: int) -> None:

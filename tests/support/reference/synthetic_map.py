@@ -12,6 +12,7 @@ from companion.messages import Bytes
 from companion.slam.compiled.patch_alignment import STORED
 from companion.slam.features.orb_features import Features
 from companion.slam.features.patches import Patches, image_levels
+from companion.slam.map.seen import Seen
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from tests.support.flights.scene import DOWN_LOOKING
 
@@ -104,9 +105,9 @@ def mapped(
         features, index = ground.seen_from(world_from_camera)
         inside = map_from_world.apply_to_pose(world_from_camera)
         keyframe = Keyframe(
-            first_id + k, first_id + k, (first_id + k) * 500_000_000, inside.inverse(), features,
-            np.full(len(features), -1), features.normalised.copy(), features.whitening.copy(),
-            np.full(len(features), -1),
+            first_id + k, first_id + k, (first_id + k) * 500_000_000, inside.inverse(),
+            Seen(features, features.normalised.copy(), features.whitening.copy()),
+            np.full(len(features), -1), np.full(len(features), -1),
         )  # fmt: skip
         slam_map.keyframes[keyframe.keyframe_id] = keyframe
         oldest = first_id + k - memory

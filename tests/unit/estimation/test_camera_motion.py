@@ -10,6 +10,7 @@ from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Pose, angle_between, rotation_from_vector, yaw_rotation
 from companion.messages import Track, TrackState
 from companion.slam.features.orb_features import features_of
+from companion.slam.map.seen import Seen
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 
 STEP_NS = 50_000_000
@@ -24,8 +25,8 @@ def keyframe_at(keyframe_id: int, map_from_camera: Pose) -> Keyframe:
         np.zeros((0, 32), np.uint8),
     )  # fmt: skip
     return Keyframe(
-        keyframe_id, 0, 0, map_from_camera.inverse(), features, ids, none.astype(np.float64),
-        np.zeros((0, 2, 2)), ids,
+        keyframe_id, 0, 0, map_from_camera.inverse(),
+        Seen(features, none.astype(np.float64), np.zeros((0, 2, 2))), ids, ids,
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
@@ -10,21 +11,39 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from companion.app.cli import main
 from companion.app.maps import map_command
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Similarity, yaw_rotation
+from companion.products.array_file import ArrayFile
 from companion.products.site_map_file import (
     SITE_MAP,
-    VERSION,
-    SiteMapError,
-    _digest,
     read_head,
     read_site_map,
     write_site_map,
 )
-from companion.products.site_map_rows import FEATURE, POINT, packed, unpacked
+from companion.products.site_map_rows import (
+    FEATURE,
+    OBSERVED,
+    PATCH,
+    POINT,
+    WHOLE_FEATURE,
+    WHOLE_POINT,
+    packed,
+    unpacked,
+)
+from companion.products.site_map_tables import (
+    BLOCK,
+    BLOCK_BEFORE,
+    VERSION,
+    SiteMapError,
+    _digest_before,
+    checksum,
+)
+from companion.slam.loop.place_recognition import place_blocks
+from companion.slam.map.map_points import PointArrays
 from companion.slam.map.site_map import (
     SiteGeoreference,
     SiteMap,
@@ -45,7 +64,7 @@ def slam_map() -> SlamMap:
     made = mapped(Ground(np.random.default_rng(5)), path, Similarity.identity(), first_id=7)
     made.keyframes[12].ned_from_camera = flown(np.zeros(2)).rotation
     made.keyframes[12].refined_for[:] = made.keyframes[12].point_ids
-    made.keyframes[12].whitening *= 2.0
+    made.keyframes[12].whitening[:] *= 2.0
     return made
 
 
@@ -139,24 +158,70 @@ def test_what_is_damaged_is_left_out_and_named(path: Path, site: SiteMap) -> Non
     assert len(read.damaged) == 2 and "keyframe 3" in read.damaged
     assert len(read.site.keyframes) == 9
     lost = np.isnan(read.site.points.positions[:, 0])
-    assert lost[:1024].all() and not lost[1024:].any()
+    assert lost[:BLOCK].all() and not lost[BLOCK:].any()
     seen = np.concatenate([k.point_ids for k in read.site.keyframes])
     assert not lost[seen[seen >= 0]].any()
     assert main(["map", "verify", str(path)]) == 1
 
 
 def test_features_of_another_layout_are_left_out(path: Path) -> None:
-    """Whole by their digest, but not what this version writes."""
+    """Whole by their checksum, but not what this version writes."""
     with closing(sqlite3.connect(path)) as file:
-        part, said, features = file.execute(
-            "SELECT part, json, features FROM keyframe WHERE id = 3"
-        ).fetchone()
-        digest = _digest(part, said, features[:-1])
+        *row, _ = file.execute("SELECT * FROM keyframe WHERE id = 3").fetchone()
+        row[-1] = row[-1][:-1]
         file.execute(
-            "UPDATE keyframe SET features = ?, digest = ? WHERE id = 3", (features[:-1], digest)
+            "UPDATE keyframe SET features = ?, checksum = ? WHERE id = 3", (row[-1], checksum(row))
         )
         file.commit()
     assert read_site_map(path).damaged == ("keyframe 3",)
+
+
+def test_an_index_of_places_is_that_of_its_keyframes(path: Path, site: SiteMap) -> None:
+    read = read_site_map(path)
+    made = place_blocks((k.keyframe_id, k.features.descriptors) for k in site.keyframes)
+    for kept, new in zip(read.places, made, strict=True):
+        for a, b in zip(kept, new, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_damaged_index_is_not_used(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = read_site_map(path)
+    with closing(sqlite3.connect(path)) as file:
+        (owners,) = file.execute("SELECT owners FROM places").fetchone()
+        file.execute("UPDATE places SET owners = ?", (owners[:-1] + b"\xff",))
+        file.commit()
+    read = read_site_map(path)
+    assert len(read.damaged) == 1 and "index" in read.damaged[0]
+    assert whole.places and not read.places and len(read.site.keyframes) == 10
+    assert main(["map", "verify", str(path)]) == 1
+    assert "index" in capsys.readouterr().out
+
+
+def test_an_index_of_another_version_is_made_anew(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.products.site_map_rows.PLACES_VERSION", 2)
+    read = read_site_map(path)
+    assert not read.places and not read.damaged
+
+
+def test_a_flight_knows_its_map_by_what_was_whole(path: Path, site: SiteMap) -> None:
+    whole = read_site_map(path).digest
+    assert read_site_map(path, ArrayFile(path.parent)).digest == whole
+    write_site_map(path, replace(site, revision=2))
+    assert read_site_map(path).digest != whole
+    write_site_map(path, site)
+    with closing(sqlite3.connect(path)) as file:
+        file.execute("UPDATE keyframe SET features = zeroblob(length(features)) WHERE id = 3")
+        file.commit()
+    assert read_site_map(path).digest != whole
+
+
+def test_what_is_damaged_while_it_is_used_ends_the_use(path: Path) -> None:
+    (keyframe, *_) = read_site_map(path, ArrayFile(path.parent)).site.keyframes
+    path.write_bytes(path.read_bytes()[:20_000])
+    with pytest.raises(SiteMapError, match="keyframe 0 is damaged"):
+        _ = keyframe.features
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
@@ -193,38 +258,78 @@ def test_a_newer_version_is_refused_in_words(path: Path) -> None:
         read_head(path)
 
 
-def test_the_version_before_is_read_the_same(path: Path) -> None:
+@pytest.mark.parametrize("version", [1, 2])
+def test_versions_before_are_read_the_same(path: Path, version: int) -> None:
     new = read_site_map(path).site
+    as_before(path, version)
+    for far in (None, ArrayFile(path.parent)):
+        old = read_site_map(path, far)
+        assert not old.damaged and not old.places
+        for name, a, b in zip(PointArrays._fields, old.site.points, new.points, strict=True):
+            every = np.arange(len(b))
+            np.testing.assert_array_equal(a[every], b[every], err_msg=name)
+        for one, other in zip(old.site.keyframes, new.keyframes, strict=True):
+            np.testing.assert_array_equal(one.point_ids, other.point_ids)
+            np.testing.assert_array_equal(one.refined_for, other.refined_for)
+            np.testing.assert_array_equal(one.normalised, other.normalised)
+            np.testing.assert_array_equal(one.whitening, other.whitening)
+            np.testing.assert_array_equal(one.features.descriptors, other.features.descriptors)
+
+
+def as_before(path: Path, version: int) -> None:
+    """Turn a file into one of a version before 3, of a map of less than 1024 points or more."""
+
+    def bytes_of(rows: NDArray[np.void]) -> bytes:
+        return packed(rows) if version == 2 else rows.tobytes()
+
+    def whole(of: np.dtype[np.void], *parts: NDArray[np.void]) -> NDArray[np.void]:
+        rows = np.zeros(len(parts[0]), of)
+        for part in parts:
+            for name in part.dtype.names or ():
+                rows[name] = part[name]
+        return rows
+
     with closing(sqlite3.connect(path)) as file:
-        file.execute("PRAGMA user_version = 1")
-        for key, part, said, data in file.execute(
-            "SELECT id, part, json, features FROM keyframe"
-        ).fetchall():
-            rows = unpacked(data, FEATURE, 10_000).tobytes()
+        tables = {
+            name: file.execute(f"SELECT * FROM {name}").fetchall()
+            for name in ("head", "part", "keyframe", "points")
+        }
+        for name in (*tables, "places"):
+            file.execute(f"DROP TABLE {name}")
+        for name in ("head", "part"):
+            file.execute(f"CREATE TABLE {name} (id INTEGER PRIMARY KEY, json, digest)")
+            for key, said_now, _ in tables[name]:
+                said = re.sub('"n_places": 1, |"places_version": 1, ', "", said_now)
+                file.execute(
+                    f"INSERT INTO {name} VALUES (?, ?, ?)", (key, said, _digest_before([said]))
+                )
+        file.execute("CREATE TABLE keyframe (id INTEGER PRIMARY KEY, part, json, features, digest)")
+        for key, part, said, observed, features, _ in tables["keyframe"]:
+            rows = whole(WHOLE_FEATURE, unpacked(features, FEATURE, 10_000))
+            seen, rows["point_ids"] = np.frombuffer(observed, OBSERVED), -1
+            rows["point_ids"][seen["feature"]] = seen["point"]
+            rows["refined"][seen["feature"]] = seen["refined"]
+            values = part, said, bytes_of(rows)
             file.execute(
-                "UPDATE keyframe SET features = ?, digest = ? WHERE id = ?",
-                (rows, _digest(part, said, rows), key),
+                "INSERT INTO keyframe VALUES (?, ?, ?, ?, ?)",
+                (key, *values, _digest_before(values)),
             )
-        for first, data in file.execute("SELECT id, data FROM points").fetchall():
-            rows = unpacked(data, POINT, 10_000).tobytes()
-            file.execute(
-                "UPDATE points SET data = ?, digest = ? WHERE id = ?",
-                (rows, _digest(first, rows), first),
-            )
+        points = np.concatenate([
+            whole(WHOLE_POINT, unpacked(data, POINT, BLOCK), unpacked(patches, PATCH, BLOCK))
+            for _, data, patches, _ in tables["points"]
+        ])  # fmt: skip
+        file.execute("CREATE TABLE points (id INTEGER PRIMARY KEY, data, digest)")
+        for first in range(0, len(points), BLOCK_BEFORE):
+            block = first, bytes_of(points[first : first + BLOCK_BEFORE])
+            file.execute("INSERT INTO points VALUES (?, ?, ?)", (*block, _digest_before(block)))
+        file.execute(f"PRAGMA user_version = {version}")
         file.commit()
-    old = read_site_map(path)
-    assert not old.damaged
-    for a, b in zip(old.site.points, new.points, strict=True):
-        np.testing.assert_array_equal(a, b)
-    for one, other in zip(old.site.keyframes, new.keyframes, strict=True):
-        np.testing.assert_array_equal(one.normalised, other.normalised)
-        np.testing.assert_array_equal(one.features.descriptors, other.features.descriptors)
 
 
 def test_rows_come_back_from_few_bytes_and_not_more_than_are_due() -> None:
     rows = np.zeros(1000, FEATURE)
     rows["descriptors"] = np.random.default_rng(1).integers(0, 256, (1000, 32))
-    rows["point_ids"] = np.arange(1000)
+    rows["sharpness"] = np.arange(1000)
     data = packed(rows)
     assert len(data) < 0.8 * rows.nbytes
     np.testing.assert_array_equal(unpacked(data, FEATURE, 1000), rows)

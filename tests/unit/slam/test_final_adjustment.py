@@ -10,6 +10,7 @@ from companion.geometry.transforms import Array, Pose, Similarity, rotation_from
 from companion.slam.features.orb_features import FeatureExtractor
 from companion.slam.features.patches import image_levels
 from companion.slam.map.local_map import Projector
+from companion.slam.map.seen import Seen
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping.mapper import FINAL_ITERATIONS, Mapper
 from companion.slam.mapping.mapping_worker import MapLock
@@ -55,8 +56,8 @@ def pass_over(slam_map: SlamMap, world: PlaneWorld, poses: list[Pose]) -> None:
         seen = extractor.extract(grey)
         key, none = len(slam_map.keyframes), np.full(len(seen), -1)
         keyframe = Keyframe(
-            key, key, key, world_from_camera.inverse(), seen, none, seen.normalised.copy(),
-            seen.whitening.copy(), none.copy(),
+            key, key, key, world_from_camera.inverse(),
+            Seen(seen, seen.normalised.copy(), seen.whitening.copy()), none, none.copy(),
         )  # fmt: skip
         slam_map.keyframes[key] = keyframe
         slam_map.keyframes_moved()

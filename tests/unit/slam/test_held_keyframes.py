@@ -9,6 +9,7 @@ from companion.config import FeaturesConfig
 from companion.geometry.transforms import Pose, Similarity, yaw_rotation
 from companion.messages import LoopClosed
 from companion.slam.loop.loop_closure import LoopClosure
+from companion.slam.map.seen import Seen
 from companion.slam.map.site_map import SiteGeoreference, SitePart, site_map_of, slam_map_of
 from companion.slam.map.sparse_map import SlamMap
 from companion.slam.mapping.atlas import Atlas
@@ -53,8 +54,9 @@ def flown_on(atlas: Atlas, ground: Ground, pose: Pose, here_from_world: Similari
     features, _ = ground.seen_from(pose)
     keyframe = type(newest)(
         newest.keyframe_id + 1, newest.seq + 1, newest.t_ns + 500_000_000,
-        here_from_world.apply_to_pose(pose).inverse(), features, np.full(len(features), -1),
-        features.normalised.copy(), features.whitening.copy(), np.full(len(features), -1), GREY,
+        here_from_world.apply_to_pose(pose).inverse(),
+        Seen(features, features.normalised.copy(), features.whitening.copy()),
+        np.full(len(features), -1), np.full(len(features), -1), GREY,
     )  # fmt: skip
     seen = atlas.mapper.fusion._projector.visible(
         here, keyframe.camera_from_map, np.flatnonzero(here.alive[: here.n_points])

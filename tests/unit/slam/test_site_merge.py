@@ -12,6 +12,7 @@ from companion.app.cli import main
 from companion.geometry.transforms import Array, Pose, Similarity, yaw_rotation
 from companion.products.site_map_file import read_site_map, write_site_map
 from companion.slam.map.patch_refinement import SIGMA_PX
+from companion.slam.map.seen import Seen
 from companion.slam.map.site_map import SiteGeoreference, SiteMap, SitePart, site_map_of
 from companion.slam.mapping.site_merge import merge_sites
 from tests.bench.kept_map import rms, similarity
@@ -85,8 +86,10 @@ def refined(ground: Ground, path: list[Pose], name: str) -> SiteMap:
         ids = keyframe.point_ids
         seen = keyframe.camera_from_map.apply(made.positions[ids])
         noise = rng.normal(scale=0.05 / CAMERA.fx, size=(len(ids), 2))
-        keyframe.normalised = seen[:, :2] / seen[:, 2:] + noise
-        keyframe.whitening = keyframe.features.whitening / SIGMA_PX
+        keyframe.seen = Seen(
+            keyframe.features, seen[:, :2] / seen[:, 2:] + noise,
+            keyframe.features.whitening / SIGMA_PX,
+        )  # fmt: skip
         keyframe.refined_for = ids.copy()
     georeference = SiteGeoreference(None, 1.0, 0.02, 0.01, "gps")
     to_world = Similarity(1.02, yaw_rotation(0.1), np.array([1.0, 0.0, 0.0]))

@@ -18,7 +18,8 @@ from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Similarity
 from companion.messages import Frame, Georeference, Warned
 from companion.pilot_messages import OTHER, of_warning
-from companion.products.site_map_file import SiteMapError, read_site_map, write_site_map
+from companion.products.site_map_file import read_site_map, write_site_map
+from companion.products.site_map_tables import SiteMapError
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.stages.localisation_work import MAP_DAMAGED, MAP_NOT_USED, work
 from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
