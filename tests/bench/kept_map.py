@@ -152,8 +152,7 @@ def merged(flights: Path, work: Path) -> None:
     paths = [work / name / "site.map" for name in MERGED]
     out = work / "merged.map"
     began_s = time.perf_counter()
-    for line in merge(paths, out):
-        print(line)
+    print(merge(paths, out))
     print(f"merged in {time.perf_counter() - began_s:.0f} s, {out.stat().st_size * 1e-6:.1f} MB")
     both = read_site_map(out).site
     found, true = keyframes_of(both, flights)

@@ -40,8 +40,7 @@ def _map(arguments: argparse.Namespace, signals: StopSignals) -> int | None:
     elif arguments.what == "merge":
         if len(arguments.maps) < 2:
             raise InputError("merge wants two maps or more")
-        print("\n".join(maps.merge(arguments.maps, arguments.out)))
-        print(arguments.out)
+        print(maps.merge(arguments.maps, arguments.out, arguments.json))
     elif arguments.what == "prune":
         print(maps.prune(arguments.map, arguments.out, arguments.within))
         print(arguments.out)
@@ -74,7 +73,9 @@ def add_parsers(commands: Any) -> None:
     )
     add_path(exported, "--out", "DIR", "folder for them", required=True)
     merged = whats.add_parser(
-        "merge", help="merge maps of several flights over a site, and adjust them as one"
+        "merge",
+        parents=[json_option()],
+        help="merge maps of several flights over a site, and adjust them as one",
     )
     add_path(merged, "maps", "MAP", MAP, nargs="+")
     add_path(merged, "--out", "FILE", NEW_MAP, required=True)

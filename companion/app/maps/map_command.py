@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from companion.app.maps.merged_maps import merged_map
 from companion.errors import InputError
 from companion.estimation.site.site_use import world_from_site
 from companion.geometry.geodesy import GeoOrigin
@@ -17,6 +19,7 @@ from companion.products.atomic_file import write_atomically
 from companion.products.cloud import Cloud
 from companion.products.cloud_ply import ply_parts
 from companion.products.flight_result import WorldPose
+from companion.products.report.batch_page import MergedFlight
 from companion.products.site_map_file import (
     ReadSiteMap,
     map_path,
@@ -109,13 +112,39 @@ def prune(path: Path, out: Path, spacing_deg: float) -> str:
     return f"{len(pruned.keyframes)} of {len(site.keyframes)} keyframes left, {size_mb:.1f} MB"
 
 
-def merge(paths: Sequence[Path], out: Path) -> list[str]:
-    """Merge maps, in this order, into a new file; a line about each that was added.
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """How far the keyframes of a map moved as it became one with another: as a whole, and besides.
+
+    `rest_m` is RMS.
+    """
+
+    flights: tuple[str, ...]
+    whole_m: float
+    rest_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Join:
+    """A map that was added to those before it.
+
+    `n_shared` points are observed by both. With `by_one_place` they are too few to bind the two,
+    which then rests on the place where they were joined.
+    """
+
+    map: str
+    n_shared: int
+    by_one_place: bool
+    moved: tuple[Moved, ...]
+
+
+def merge(paths: Sequence[Path], out: Path, as_json: bool = False) -> str:
+    """Merge maps, in this order, into a new file; how they were joined, and what each flight gave.
 
     InputError where one shows no place that is seen in those before it, or too little of one.
     """
     merged = read_site_map(map_path(paths[0])).site
-    lines = []
+    joins = []
     for path in paths[1:]:
         other = read_site_map(map_path(path)).site
         if (other.scale_factor, other.n_levels) != (merged.scale_factor, merged.n_levels):
@@ -129,21 +158,45 @@ def merge(paths: Sequence[Path], out: Path) -> list[str]:
             raise InputError(f"{path}: no place in it is seen in {', '.join(map(str, paths[:1]))}")
         n = len(merged.keyframes)
         n_shared = len(shared_points(both.keyframes[:n], both.keyframes[n:]))
-        bound = (
-            f"bound by {n_shared} points that both see"
-            if n_shared >= MIN_SHARED
-            else f"joined at one place only, with {n_shared} points that both see"
-        )
-        lines.append(f"{path}: {bound}; {_moved(merged, other, both, apart)}")
+        moved = _moved(merged, other, both, apart)
+        joins.append(Join(str(path), n_shared, n_shared < MIN_SHARED, moved))
         merged = both
     write_site_map(out, merged)
-    return lines
+    made = merged_map(str(out), merged)
+    if as_json:
+        return json.dumps({"joins": [asdict(each) for each in joins], **asdict(made)}, indent=2)
+    return "\n".join([*map(_join_in_words, joins), *map(_flight_in_words, made.flights), str(out)])
 
 
-def _moved(before: SiteMap, other: SiteMap, both: SiteMap, apart: Similarity) -> str:
-    """Agreement of two maps: how far the keyframes of each moved as they became one."""
+def _join_in_words(join: Join) -> str:
+    bound = (
+        f"joined at one place only, with {join.n_shared} points that both see"
+        if join.by_one_place
+        else f"bound by {join.n_shared} points that both see"
+    )
+    moved = (
+        f"{', '.join(each.flights)} moved by {each.whole_m:.2f} m as a whole, {each.rest_m:.2f} m "
+        "RMS besides"
+        for each in join.moved
+    )
+    return "; ".join([f"{join.map}: {bound}", *moved])
+
+
+def _flight_in_words(flight: MergedFlight) -> str:
+    apart = (
+        "too few to tell how far apart"
+        if flight.apart_m is None
+        else f"{flight.apart_m:.3f} m apart there (one axis)"
+    )
+    return (
+        f"{flight.flight} gave {flight.path_m:.0f} m, {flight.n_keyframes} keyframes, "
+        f"{flight.n_points} points; {flight.n_shared} are seen by other flights, {apart}"
+    )
+
+
+def _moved(before: SiteMap, other: SiteMap, both: SiteMap, apart: Similarity) -> tuple[Moved, ...]:
     now = np.stack([k.camera_from_map.inverse().translation for k in both.keyframes])
-    parts = []
+    out = []
     for site, in_world, places in (
         (before, Similarity.identity(), now[: len(before.keyframes)]),
         (other, apart, now[len(before.keyframes) :]),
@@ -152,11 +205,10 @@ def _moved(before: SiteMap, other: SiteMap, both: SiteMap, apart: Similarity) ->
             np.stack([k.camera_from_map.inverse().translation for k in site.keyframes])
         )
         off = places - then
-        whole_m = float(np.linalg.norm(off.mean(0)))
         rest_m = float(np.sqrt(((off - off.mean(0)) ** 2).sum(1).mean()))
-        names = ", ".join(part.flight for part in site.parts)
-        parts.append(f"{names} moved by {whole_m:.2f} m as a whole, {rest_m:.2f} m RMS besides")
-    return "; ".join(parts)
+        flights = tuple(part.flight for part in site.parts)
+        out.append(Moved(flights, float(np.linalg.norm(off.mean(0))), rest_m))
+    return tuple(out)
 
 
 def _head_numbers(path: Path, head: SiteHead) -> dict[str, Any]:

@@ -83,15 +83,18 @@ def _kept(path: Path, out: Path, number: int) -> MergedMap:
     site = read_site_map(path).site
     name = SITE_MAP if number == 1 else OTHERS.format(number)
     write_site_map(out / name, site)
-    return MergedMap(name, len(site.keyframes), len(site.points.positions), _flights(site))
+    return merged_map(name, site)
 
 
-def _flights(site: SiteMap) -> tuple[MergedFlight, ...]:
+def merged_map(name: str, site: SiteMap) -> MergedMap:
     """Share of each flight in a map, and how far it agrees with all others."""
     found = []
     for n, part in enumerate(site.parts):
         own, others = (SiteFlight(site, site.part_of == n), SiteFlight(site, site.part_of != n))
         apart_m, n_shared = disagreement_m(site, own, others)
         n_points = int(np.count_nonzero(own.n_observers))
-        found.append(MergedFlight(part.flight, len(own.keyframes), n_points, n_shared, apart_m))
-    return tuple(found)
+        path_m = float(np.linalg.norm(np.diff(own.path_m, axis=0), axis=1).sum())
+        found.append(
+            MergedFlight(part.flight, path_m, len(own.keyframes), n_points, n_shared, apart_m)
+        )
+    return MergedMap(name, len(site.keyframes), len(site.points.positions), tuple(found))

@@ -25,13 +25,14 @@ class BatchResult:
 
 @dataclass(frozen=True, slots=True)
 class MergedFlight:
-    """Share of one flight in a map: its keyframes, and the points that they observe.
+    """Share of one flight in a map: its keyframes, the way along them, the points they observe.
 
     Of these `n_shared` are observed by other flights too, from which it is `apart_m` away there:
     one standard deviation, of one axis; None where they are too few to tell.
     """
 
     flight: str
+    path_m: float
     n_keyframes: int
     n_points: int
     n_shared: int

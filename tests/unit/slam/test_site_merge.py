@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -170,6 +171,17 @@ def test_the_command_merges_files(
     out = tmp_path / "both.map"
     paths = [str(tmp_path / "0.map"), str(tmp_path / "1.map")]
     assert main(["map", "merge", *paths, "--out", str(out)]) == 0
-    assert "second moved by" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "second moved by" in said and "second gave" in said
     assert len(read_site_map(out).site.keyframes) == 18
+    assert main(["map", "merge", *paths, "--out", str(out), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    (join,) = told["joins"]
+    assert join["n_shared"] >= 20 and not join["by_one_place"]
+    assert [each["flights"] for each in join["moved"]] == [["first"], ["second"]]
+    assert told["n_keyframes"] == 18
+    for flight, site in zip(told["flights"], sites, strict=True):
+        way_m = np.linalg.norm(np.diff(places(site), axis=0), axis=1).sum()
+        assert abs(flight["path_m"] / way_m - 1.0) < 0.05 and flight["n_keyframes"] == 9
+        assert 0 < flight["apart_m"] < 0.1
     assert main(["map", "merge", paths[0], "--out", str(out)]) == 2
