@@ -5,13 +5,14 @@
 Flies the camera and the autopilot of the tests in real time: the mount is found by hand and the
 lens calibrated, with pictures while each goes on; then the other views, in flight and after it.
 Prints what each view is wider than its screen by, and what the browser complained of. Once all
-parts are there, OUT has the pictures of docs/page.md too: page_now.png, page_setup.png and
+parts are there, OUT has the pictures of docs/page.md too: page_now.webp, page_setup.webp and
 page_views.webp.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import re
 import tempfile
 from pathlib import Path
@@ -67,7 +68,8 @@ class Operator:
             if screen == "phone" and name in SHEET:
                 self.page.screenshot(path=self._out / f"{name}_sheet.png")
             if screen == ALONE.get(name):
-                self.page.screenshot(path=self._out / f"page_{name}.png")
+                with Image.open(io.BytesIO(self.page.screenshot())) as view:
+                    view.save(self._out / f"page_{name}.webp", quality=80)
             over = self.page.evaluate("document.documentElement.scrollWidth") - width
             print(f"{name}, {screen}: {max(over, 0)} pixels too wide")
         print(*self._browser.complaints, sep="\n", end="", flush=True)
