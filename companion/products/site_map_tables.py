@@ -69,10 +69,10 @@ class SiteMapError(InputError):
 
 def checksum(values: Sequence[Any]) -> int:
     """CRC-32 of the values of a row: four times as fast as a digest, and nobody forges a map."""
-    total = 0
-    for value in values:
-        data = value if isinstance(value, bytes) else str(value).encode()
-        total = zlib.crc32(data, zlib.crc32(len(data).to_bytes(8, "little"), total))
+    data = [value if isinstance(value, bytes) else str(value).encode() for value in values]
+    total = zlib.crc32(repr([len(each) for each in data]).encode())
+    for each in data:
+        total = zlib.crc32(each, total)
     return total
 
 

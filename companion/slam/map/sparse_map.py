@@ -164,8 +164,7 @@ class SlamMap(MapPoints):
         """Clear observations of removed points from `keyframes`."""
         for keyframe in keyframes:
             ids = keyframe.point_ids
-            dead = (ids >= 0) & ~self.alive[np.maximum(ids, 0)]
-            ids[dead] = -1
+            ids[~self.alive[ids]] = -1  # the last row is that of no point
 
     def observations_of(self, keyframe: Keyframe) -> tuple[Ints, Ints]:
         """Features and living points (same length) that a keyframe observes."""
