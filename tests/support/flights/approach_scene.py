@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
@@ -16,6 +17,9 @@ NOTHING = np.float32(1e4)
 SKY = 200
 SAMPLES = 2
 """Rays along each side of a pixel."""
+Met = tuple[NDArray[np.intp], Array | Floats, Array, Array, Array | Floats]
+"""Numbers of the rays that meet a thing, and of these what `_met` says, the cosine of rays as long
+as they are."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,33 +154,46 @@ def _met(thing: Sheet | Rod, rays: Floats, eye: Array) -> tuple[Floats, Floats, 
     the angles at which they meet it, of unit rays."""
     with np.errstate(divide="ignore", invalid="ignore"):
         if isinstance(thing, Sheet):
-            normal = np.cross(thing.side_a, thing.side_b)
-            away = np.float32((thing.corner - eye) @ normal) / (rays @ normal.astype(np.float32))
-            at = eye + away[:, None] * rays - thing.corner
-            lengths = [float(np.linalg.norm(side)) for side in (thing.side_a, thing.side_b)]
-            a, b = (
-                at @ (s / n) for s, n in zip((thing.side_a, thing.side_b), lengths, strict=True)
-            )
-            cosine = np.abs(rays @ (normal / np.linalg.norm(normal)).astype(np.float32))
-            met = (a >= 0) & (a <= lengths[0]) & (b >= 0) & (b <= lengths[1]) & (away > 0)
+            met, away, a, b, cosine = _sheet_met(thing, rays, eye)
         else:
-            length = float(np.linalg.norm(thing.end - thing.begin))
-            axis = (thing.end - thing.begin) / length
-            across, start = rays - np.outer(rays @ axis, axis), eye - thing.begin
-            start = start - (start @ axis) * axis
-            aa, ab = (across**2).sum(1), across @ start
-            root = ab**2 - aa * (start @ start - thing.radius_m**2)
-            away = (-ab - np.sqrt(root)) / aa
-            at = eye + away[:, None] * rays - thing.begin
-            b = at @ axis
-            side = at - b[:, None] * axis
-            first = np.cross(axis, [0.3, 0.5, 0.81])
-            first /= np.linalg.norm(first)
-            a = thing.radius_m * np.arctan2(side @ np.cross(axis, first), side @ first)
-            cosine = np.abs((side * rays).sum(1)) / thing.radius_m
-            met = (root > 0) & (b >= 0) & (b <= length) & (away > 0)
-    return (
-        np.where(met, away, NOTHING).astype(np.float32),
-        np.where(met, a, 0).astype(np.float32), np.where(met, b, 0).astype(np.float32),
-        np.where(met, cosine / np.linalg.norm(rays, axis=1), 1).astype(np.float32),
+            met, away, a, b, cosine = _rod_met(thing, rays, eye)
+    whole = [np.full(len(rays), none, np.float32) for none in (NOTHING, 0.0, 0.0, 1.0)]
+    found = away, a, b, cosine / np.linalg.norm(rays[met], axis=1)
+    for each, part in zip(whole, found, strict=True):
+        each[met] = part
+    return whole[0], whole[1], whole[2], whole[3]
+
+
+def _sheet_met(sheet: Sheet, rays: Floats, eye: Array) -> Met:
+    normal = np.cross(sheet.side_a, sheet.side_b)
+    away: Floats = np.float32((sheet.corner - eye) @ normal) / (rays @ normal.astype(np.float32))
+    at = eye + away[:, None] * rays - sheet.corner
+    lengths = [float(np.linalg.norm(side)) for side in (sheet.side_a, sheet.side_b)]
+    a, b = (at @ (s / n) for s, n in zip((sheet.side_a, sheet.side_b), lengths, strict=True))
+    cosine = np.abs(rays @ (normal / np.linalg.norm(normal)).astype(np.float32))
+    met = np.flatnonzero(
+        (a >= 0) & (a <= lengths[0]) & (b >= 0) & (b <= lengths[1]) & (away > 0)
     )  # fmt: skip
+    return met, away[met], a[met], b[met], cosine[met]
+
+
+def _rod_met(rod: Rod, rays: Floats, eye: Array) -> Met:
+    """All but a ray's distance from it is of those alone that pass near it."""
+    length = float(np.linalg.norm(rod.end - rod.begin))
+    axis = (rod.end - rod.begin) / length
+    across, start = rays - np.outer(rays @ axis, axis), eye - rod.begin
+    start = start - (start @ axis) * axis
+    aa, ab = np.einsum("ni,ni->n", across, across), across @ start
+    root = ab**2 - aa * (start @ start - rod.radius_m**2)
+    near = np.flatnonzero(root > 0)
+    rays = rays[near]
+    away = (-ab[near] - np.sqrt(root[near])) / aa[near]
+    at = eye + away[:, None] * rays - rod.begin
+    b = at @ axis
+    side = at - b[:, None] * axis
+    first = np.cross(axis, [0.3, 0.5, 0.81])
+    first /= np.linalg.norm(first)
+    a = rod.radius_m * np.arctan2(side @ np.cross(axis, first), side @ first)
+    cosine = np.abs((side * rays).sum(1)) / rod.radius_m
+    met = np.flatnonzero((b >= 0) & (b <= length) & (away > 0))
+    return near[met], away[met], a[met], b[met], cosine[met]
