@@ -210,7 +210,7 @@ def keyframe_of(
 
 
 def seen_of(rows: NDArray[np.void], camera: Camera, scale_factor: float) -> Seen:
-    """What a keyframe saw, of the rows of its features."""
+    """View of a keyframe, of the rows of its features."""
     normalised: Array = rows["normalised"].astype(np.float64)
     features = features_of(
         camera, scale_factor, pixels_of(camera, normalised), normalised.copy(),

@@ -114,7 +114,7 @@ def prune(path: Path, out: Path, spacing_deg: float) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """How far the keyframes of a map moved as it became one with another: as a whole, and besides.
+    """Motion of the keyframes of a map as it became one with another: as a whole, and besides.
 
     `rest_m` is RMS.
     """

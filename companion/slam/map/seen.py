@@ -1,4 +1,4 @@
-"""What a keyframe saw: its features and their refinement, in memory or read once they are used."""
+"""View of a keyframe: its features and their refinement, in memory or read once they are used."""
 
 from __future__ import annotations
 

@@ -164,7 +164,7 @@ def slam_map_of(site: SiteMap, camera: Camera) -> SlamMap:
 
 
 def _seen_by(camera: Camera, keyframe: Keyframe) -> Seen | SeenLater:
-    """What a keyframe saw, at the pixels where a camera sees it."""
+    """View of a keyframe, at the pixels where a camera sees it."""
     seen = keyframe.seen_apart
 
     def read() -> Seen:

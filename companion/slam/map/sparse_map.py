@@ -62,7 +62,7 @@ class Keyframe:
 
     @property
     def seen_apart(self) -> Seen | SeenLater:
-        """What it saw, for a copy that may be changed: of one left behind that is never."""
+        """The same for a copy of the keyframe, to be refined apart: one left behind never is."""
         return self.seen if isinstance(self.seen, SeenLater) or self.is_far else self.seen.copied()
 
     @property

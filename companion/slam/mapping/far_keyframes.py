@@ -36,7 +36,7 @@ class ArrayFile(Protocol):
 
 
 def put_away(seen: Seen, file: ArrayFile) -> Seen:
-    """What a keyframe saw that nothing changes any more, from a file, if that takes it."""
+    """A copy in a file, if that takes it, of what a keyframe saw that nothing changes any more."""
     kept = file.put(_arrays_of(seen))
     return seen if kept is None else _seen_of(kept)
 
