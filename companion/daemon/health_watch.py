@@ -15,6 +15,7 @@ from typing import Any
 from companion import __version__
 from companion.config import Config
 from companion.daemon.flights.flights import Flights
+from companion.daemon.flights.flown_stages import makes_depth
 from companion.daemon.flights.viewing import VIEWERS
 from companion.daemon.pose.senders import Senders
 from companion.health import (
@@ -79,6 +80,7 @@ class HealthWatch:
         self._began_ns = clock.now_ns()
         self._config, self._believed = config.daemon, config.telemetry.use
         self._governor = Governor(config.daemon.hot_c)
+        self._governor.makes_depth = makes_depth(config)
         self._lines = StatusLines(config.daemon.status_every_s)
         self._load_reader = SystemLoad(Path(config.daemon.flights))
         self.load = ComputerLoad()
@@ -113,11 +115,13 @@ class HealthWatch:
     def reconfigure(self, config: Config) -> None:
         """Apply a changed configuration."""
         self._believed = config.telemetry.use
+        is_other = config.daemon.hot_c != self._config.hot_c
+        if is_other or makes_depth(config) != self._governor.makes_depth:
+            self._governor = Governor(config.daemon.hot_c) if is_other else self._governor
+            self._governor.makes_depth = makes_depth(config)
+            self._apply()
         if config.daemon == self._config:
             return
-        if config.daemon.hot_c != self._config.hot_c:
-            self._governor = Governor(config.daemon.hot_c)
-            self._apply()
         self._config = config.daemon
         self._lines = StatusLines(config.daemon.status_every_s)
 

@@ -92,6 +92,8 @@ class Governor:
         self._level = LEVELS[0]
         self.keeps_viewer = False
         """True while somebody needs its pictures, whatever the level."""
+        self.makes_depth = True
+        """False where there is no dense map to reduce: its levels would only cost time."""
         self.why = ""
         """Reason of the present level, in words."""
         self._raised_ns: int | None = None
@@ -103,7 +105,8 @@ class Governor:
     @property
     def level(self) -> Level:
         """Work allowed now."""
-        return replace(self._level, viewer=True) if self.keeps_viewer else self._level
+        level = self._level if self.makes_depth else replace(self._level, dense_share=1.0)
+        return replace(level, viewer=True) if self.keeps_viewer else level
 
     @property
     def degraded(self) -> str:
@@ -146,15 +149,28 @@ class Governor:
             elif forgotten:
                 self._recovery_s = RECOVERY_S
             self._lowered_ns = None
-        self._level, self.why = LEVELS[self._level.number + 1], why
+        self._level, self.why = self._others(LEVELS[self._level.number :])[0], why
         self._raised_ns = t_ns
         return True
 
     def _lower(self, t_ns: int) -> None:
-        self._level = LEVELS[self._level.number - 1]
+        self._level = self._others(LEVELS[: self._level.number])[-1]
         self._lowered_ns = self._headroom_since_ns = t_ns
         if not self._level.number:
             self.why = ""
+
+    def _others(self, levels: tuple[Level, ...]) -> list[Level]:
+        """Those of `levels` that allow other work than the present one; of equal ones the first."""
+        seen = [self._work_of(self._level)]
+        out = []
+        for level in levels:
+            if self._work_of(level) not in seen:
+                seen.append(self._work_of(level))
+                out.append(level)
+        return out
+
+    def _work_of(self, level: Level) -> tuple[bool, float, float]:
+        return level.viewer, level.dense_share * self.makes_depth, level.feature_share
 
     def _overload(self, sample: LoadSample) -> tuple[str, float]:
         """Reason of an overload, and seconds for a level to take effect; "" for none."""

@@ -43,6 +43,24 @@ def test_late_poses_take_one_step_at_a_time_to_the_last() -> None:
     assert governor.degraded == ("viewer and dense map off, fewer features, since poses take 80 ms")
 
 
+def test_without_a_dense_map_features_are_reduced_sooner_and_come_back() -> None:
+    governor = Governor(hot_c=85)
+    governor.makes_depth = False
+    assert run(governor, range(60), LATE) == [(1, 1), (3, 4)]
+    assert governor.degraded == "viewer off, fewer features, since poses take 80 ms"
+    assert [number for _, number in run(governor, range(60, 200), EASY)] == [1, 0]
+    assert governor.degraded == ""
+
+
+def test_a_dense_map_that_begins_under_load_is_off() -> None:
+    governor = Governor(hot_c=85)
+    governor.makes_depth = False
+    run(governor, range(60), LATE)
+    governor.makes_depth = True
+    assert governor.level is LEVELS[-1]
+    assert [number for _, number in run(governor, range(60, 200), EASY)] == [3, 2, 1, 0]
+
+
 def test_a_viewer_that_is_needed_is_kept_and_the_others_give_way() -> None:
     governor = Governor(hot_c=85)
     governor.keeps_viewer = True
