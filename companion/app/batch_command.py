@@ -149,8 +149,8 @@ def _replayed(
             yield dataclasses.replace(future.result(), flight=flight)
 
 
-def _merged_pairs(client: Any, pairs: Sequence[Pair]) -> Iterator[bool]:
-    """True for each pair of maps that is one now. InputError where a process has died."""
+def _merged_pairs(client: Any, pairs: Sequence[Pair]) -> Iterator[str]:
+    """Answer of `merge_pair` for each pair of maps. InputError where a process has died."""
     futures = [client.submit(merge_pair, *pair, pure=False) for pair in pairs]
     for (first, other, _), future in zip(pairs, futures, strict=True):
         error = future.exception()
@@ -158,7 +158,7 @@ def _merged_pairs(client: Any, pairs: Sequence[Pair]) -> Iterator[bool]:
             raise error
         if error is not None:
             raise InputError(f"{first} and {other} cannot be merged: {error}") from error
-        yield bool(future.result())
+        yield str(future.result())
 
 
 def _named(flights: Sequence[Path]) -> dict[str, Path]:

@@ -140,6 +140,8 @@ def _batch(arguments: argparse.Namespace, signals: StopSignals) -> int:
     print(f"{len(results)} flight{plural}, {before} done before, {len(failed)} failed")
     for each in maps:
         print(f"{arguments.out / each.name}: {', '.join(part.flight for part in each.flights)}")
+        for why in each.refused:
+            print(f"  stays apart: {why}")
     print(f"index: {arguments.out / INDEX}")
     signals.take()
     return 1 if failed else 0

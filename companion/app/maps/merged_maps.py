@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -22,20 +23,23 @@ PART_WAY = ".merging"
 """Folder of maps that are part of another by the end."""
 Pair = tuple[Path, Path, Path]
 """Two maps, and the file that both as one go to."""
-MergePairs = Callable[[Sequence[Pair]], Iterator[bool]]
+NO_PLACE = "no place is seen in both"
+MergePairs = Callable[[Sequence[Pair]], Iterator[str]]
 """Runs `merge_pair` of disjoint pairs, all at once; results in their order."""
 
 
-def merge_pair(first: Path, other: Path, out: Path) -> bool:
-    """One Dask task: write two maps as one; False where too little of one is seen in the other."""
+def merge_pair(first: Path, other: Path, out: Path) -> str:
+    """One Dask task: write two maps as one; "" if done, else why they stay apart."""
     a, b = (read_site_map(path).site for path in (first, other))
     try:
         both = merge_sites(a, b, world_from_site(b.georeference.origin, a.georeference.origin))
-    except InputError:
-        return False
-    if both is not None:
-        write_site_map(out, both)
-    return both is not None
+    except InputError as error:
+        of_a, of_b = (" and ".join(part.flight for part in site.parts) for site in (a, b))
+        return f"{of_a}, beside {of_b}: {error}"
+    if both is None:
+        return NO_PLACE
+    write_site_map(out, both)
+    return ""
 
 
 def merge_flights(names: Sequence[str], out: Path, run: MergePairs) -> list[MergedMap]:
@@ -51,24 +55,39 @@ def merge_flights(names: Sequence[str], out: Path, run: MergePairs) -> list[Merg
     work.mkdir()
     try:
         islands = [path for name in names if (path := out / name / SITE_MAP).is_file()]
-        apart: set[tuple[Path, Path]] = set()
+        apart: dict[tuple[Path, Path], str] = {}
         n_made = 0
         while pairs := _disjoint(islands, apart):
             wanted = [(*pair, work / f"{n_made + n}.map") for n, pair in enumerate(pairs)]
             n_made += len(wanted)
-            for (first, other, made), merged in zip(wanted, run(wanted), strict=True):
-                if merged:
+            for (first, other, made), why_apart in zip(wanted, run(wanted), strict=True):
+                if why_apart:
+                    apart[first, other] = why_apart
+                else:
                     islands[islands.index(first)] = made
                     islands.remove(other)
-                else:
-                    apart.add((first, other))
         found = sorted(islands, key=lambda path: -path.stat().st_size)
-        return [_kept(path, out, n) for n, path in enumerate(found, 1)]
+        return [
+            replace(_kept(path, out, n), refused=_refused(path, apart, islands))
+            for n, path in enumerate(found, 1)
+        ]
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _disjoint(islands: Sequence[Path], apart: set[tuple[Path, Path]]) -> list[tuple[Path, Path]]:
+def _refused(
+    path: Path, apart: Mapping[tuple[Path, Path], str], islands: Sequence[Path]
+) -> tuple[str, ...]:
+    """Reasons why a map stays apart from others that are left, but for other places."""
+    return tuple(
+        why for pair, why in apart.items()
+        if path in pair and why != NO_PLACE and set(pair) <= set(islands)
+    )  # fmt: skip
+
+
+def _disjoint(
+    islands: Sequence[Path], apart: Container[tuple[Path, Path]]
+) -> list[tuple[Path, Path]]:
     """Pairs of maps that were not tried yet, none of them in two."""
     out: list[tuple[Path, Path]] = []
     taken: set[Path] = set()

@@ -47,6 +47,8 @@ class MergedMap:
     n_keyframes: int
     n_points: int
     flights: tuple[MergedFlight, ...]
+    refused: tuple[str, ...] = ()
+    """Reasons why maps that show a place of it did not become one with it."""
 
 
 def batch_page(

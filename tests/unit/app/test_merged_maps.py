@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +16,22 @@ from companion.slam.map.site_map import SiteGeoreference, SitePart, site_map_of
 from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
 
 
-def fly(out: Path, name: str, ground: Ground, begin: Array, end: Array) -> None:
+def fly(
+    out: Path, name: str, ground: Ground, begin: Array, end: Array, sigma_m: float = 1.0,
+    patches: bool = True,
+) -> None:  # fmt: skip
     made = mapped(ground, [flown(p) for p in np.linspace(begin, end, 9)], Similarity.identity())
-    placed = SiteGeoreference(None, 1.0, 0.02, 0.01, "gps")
+    placed = SiteGeoreference(None, sigma_m, 0.02, 0.01, "gps")
     part = SitePart(name, 0, CAMERA, 1)
     (out / name).mkdir()
     site = site_map_of(made, Similarity.identity(), (part,), {}, placed, 1)
+    if not patches:
+        level = np.full_like(site.points.patch_level, -1)
+        site = replace(site, points=site.points._replace(patch_level=level))
     write_site_map(out / name / SITE_MAP, site)
 
 
-def one_by_one(pairs: Sequence[Pair]) -> Iterator[bool]:
+def one_by_one(pairs: Sequence[Pair]) -> Iterator[str]:
     files = [path for pair in pairs for path in pair[:2]]
     assert len(set(files)) == len(files)  # they may be merged at the same time
     return (merge_pair(*pair) for pair in pairs)
@@ -51,3 +58,20 @@ def test_flights_that_only_a_third_one_joins_and_one_over_another_site(tmp_path:
         assert each.n_shared > 50 and each.apart_m is not None and 0 < each.apart_m < 0.1
     page = batch_page([], {}, maps).decode()
     assert "site-2.map" in page and "No place in it is seen in the other maps" in page
+
+
+def test_maps_that_meet_and_are_not_joined_are_named_with_the_reason(tmp_path: Path) -> None:
+    ground = Ground(np.random.default_rng(5))
+    west = np.array([-20.0, 0.0])
+    fly(tmp_path, "one", ground, west, west + [8, 0], sigma_m=1e-4, patches=False)
+    fly(tmp_path, "two", ground, west + [3, 1], west + [11, 1], sigma_m=1e-4, patches=False)
+    fly(tmp_path, "elsewhere", Ground(np.random.default_rng(6)), west, west + [8, 0])
+    maps = merge_flights(["one", "two", "elsewhere"], tmp_path, one_by_one)
+    told = {each.flights[0].flight: each.refused for each in maps}
+    assert told["elsewhere"] == ()
+    for name in ("one", "two"):
+        (why,) = told[name]
+        assert why.startswith("one, beside two: the maps meet at one place only")
+    page = batch_page([], {}, maps).decode()
+    assert page.count("Stays apart: one, beside two") == 2
+    assert page.count("No place in it is seen in the other maps") == 1
