@@ -64,9 +64,7 @@ class PeriodicChecks:
             self._check_stages()
             self._report(health)
             if self._settings.config.feedback.mode != "off":
-                self._proof.step(
-                    self._starts.camera, health.feedback.sending, self._starts.reported_armed
-                )
+                self._proof.step(self._starts.camera, health.feedback.sending, self._settings.armed)
             if self._feed.fault is not None:
                 self._stop.fail(str(self._feed.fault), BAD_INPUT)
             self._step_dates()

@@ -45,7 +45,8 @@ class SetupProof:
         self._camera: Camera | None = None
         self._identity = ""
         self._proven: set[str] = set()
-        self._said_to = self._armed = False
+        self._has_sent = False
+        self._armed: bool | None = None
 
     @property
     def missing(self) -> list[str]:
@@ -62,12 +63,17 @@ class SetupProof:
         self._file.put(json.dumps(kept, indent=1).encode())
 
     def step(self, camera: Camera | None, sends: bool, armed: bool) -> None:
-        """Take the state of now; what is missing is said as poses are first sent, and at arming."""
+        """Take the state of now; what is missing is said as poses are first sent, and at arming.
+
+        Nothing is said in the air, where the drone is not to be turned by hand: a process that
+        begins there begins with `armed`.
+        """
         if camera is not None and camera is not self._camera:
             self._camera, self._identity = camera, _identity_of(camera)
             self._proven = _kept(self._file.path, self._identity)
-        is_due = (sends and not self._said_to) or (armed and not self._armed)
-        self._said_to, self._armed = self._said_to or sends, armed
+        arms = armed and self._armed is False
+        is_due = arms or (sends and not armed and not self._has_sent)
+        self._has_sent, self._armed = self._has_sent or sends, armed
         if is_due and self.missing:
             self._tell(SETUP_UNPROVEN(what=", ".join(self.missing)))
 

@@ -55,6 +55,18 @@ def test_it_is_said_as_poses_begin_and_at_each_arming(tmp_path: Path) -> None:
     assert Power(tmp_path).flies() == ["mount, lens unproven: turn it by hand"] * 3
 
 
+def test_nothing_is_said_in_the_air(tmp_path: Path) -> None:
+    """Of a process that was started again there, until the next arming."""
+    power = Power(tmp_path)
+    for sends in (False, True, False, True):
+        power.proof.step(CAMERA, sends, armed=True)
+    assert power.said == [] and power.proof.missing == ["mount", "lens"]
+    power.proof.step(CAMERA, True, armed=False)
+    power.proof.step(CAMERA, True, armed=True)
+    power.proof.close(10.0)
+    assert power.said == ["mount, lens unproven: turn it by hand"]
+
+
 def test_what_was_proven_is_known_after_the_next_power_on(tmp_path: Path) -> None:
     Power(tmp_path).hears("map resumed after restart", MOUNT_FITS)
     assert Power(tmp_path).flies() == ["lens unproven: turn it by hand"] * 3
