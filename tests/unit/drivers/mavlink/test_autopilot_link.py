@@ -235,7 +235,7 @@ def test_a_recorded_flight_gives_the_samples_that_its_log_gives() -> None:
         with FakeAutopilot("ardupilot", flight=flight) as autopilot:
             async with linked(autopilot, attitude_hz=100, position_hz=50) as heard:
                 # by the autopilot's word, or a pair of positions: not of before and after the jump
-                await heard.until(lambda: heard.link.origin is not None)
+                await heard.until(lambda: heard.link.samples.positions.origin is not None)
                 heard.samples.clear()
                 autopilot.fly(unix_ns=flight.begin_unix_ns + 20 * SECOND)
                 await heard.until(lambda: heard.kinds()["attitude"] > 110)
