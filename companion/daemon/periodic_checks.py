@@ -63,8 +63,10 @@ class PeriodicChecks:
             self._check_start(health)
             self._check_stages()
             self._report(health)
-            if self._settings.config.feedback.mode != "off":
-                self._proof.step(self._starts.camera, health.feedback.sending, self._settings.armed)
+            self._proof.step(
+                self._starts.camera, health.feedback.sending, self._settings.armed,
+                self._settings.config.feedback.mode != "off",
+            )  # fmt: skip
             if self._feed.fault is not None:
                 self._stop.fail(str(self._feed.fault), BAD_INPUT)
             self._step_dates()

@@ -62,11 +62,11 @@ class SetupProof:
         kept = {"camera": self._identity, "proven": sorted(self._proven)}
         self._file.put(json.dumps(kept, indent=1).encode())
 
-    def step(self, camera: Camera | None, sends: bool, armed: bool) -> None:
+    def step(self, camera: Camera | None, sends: bool, armed: bool, is_wanted: bool = True) -> None:
         """Take the state of now; what is missing is said as poses are first sent, and at arming.
 
-        Nothing is said in the air, where the drone is not to be turned by hand: a process that
-        begins there begins with `armed`.
+        Nothing is said where poses are not wanted, nor in the air, where the drone is not to be
+        turned by hand: a process that begins there begins with `armed`.
         """
         if camera is not None and camera is not self._camera:
             self._camera, self._identity = camera, _identity_of(camera)
@@ -74,7 +74,7 @@ class SetupProof:
         arms = armed and self._armed is False
         is_due = arms or (sends and not armed and not self._has_sent)
         self._has_sent, self._armed = self._has_sent or sends, armed
-        if is_due and self.missing:
+        if is_due and is_wanted and self.missing:
             self._tell(SETUP_UNPROVEN(what=", ".join(self.missing)))
 
     def close(self, seconds: float) -> None:

@@ -67,6 +67,16 @@ def test_nothing_is_said_in_the_air(tmp_path: Path) -> None:
     assert power.said == ["mount, lens unproven: turn it by hand"]
 
 
+def test_it_is_proven_without_a_word_where_poses_are_not_wanted(tmp_path: Path) -> None:
+    power = Power(tmp_path)
+    for armed in (False, True):
+        power.proof.step(CAMERA, False, armed, is_wanted=False)
+    for what in (MOUNT_FITS, LENS_FITS):
+        power.proof.take(Warned(1, what, good=True))
+    power.proof.close(10.0)
+    assert power.said == [] and Power(tmp_path).flies() == []
+
+
 def test_what_was_proven_is_known_after_the_next_power_on(tmp_path: Path) -> None:
     Power(tmp_path).hears("map resumed after restart", MOUNT_FITS)
     assert Power(tmp_path).flies() == ["lens unproven: turn it by hand"] * 3
