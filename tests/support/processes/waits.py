@@ -19,9 +19,6 @@ from types import TracebackType
 
 RECLAIMS = 2
 """Waits that are the kernel's own: for a page of memory, where that is short."""
-HANDED_ON = 50
-"""Waits that are the kernel's own, of some thousand writes to a pseudo-terminal: on a busy machine
-it holds the line's lock itself now and then, to hand on what was written."""
 
 
 class Waits:
