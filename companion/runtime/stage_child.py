@@ -21,6 +21,7 @@ for variable in (
 # OpenCV would load an OpenCL driver with its compiler, 40 MB, for what it then does not do
 os.environ.setdefault("OPENCV_OPENCL_RUNTIME", "disabled")
 
+import contextlib  # noqa: E402
 import threading  # noqa: E402
 import traceback  # noqa: E402
 from collections.abc import Callable  # noqa: E402
@@ -81,9 +82,7 @@ def run(name: str, descriptor: int) -> int:
     except EOFError:
         return 0
     send = _sender(daemon)
-    if setup.is_live:
-        _stand_back(stage)
-    else:
+    if not setup.is_live:
         stage = lossless(stage)
     try:
         _serve(daemon, send, stage, module, setup)
@@ -110,6 +109,9 @@ def _serve(
 ) -> None:  # fmt: skip
     work = module.work(setup)
     work.begin(send)
+    if setup.is_live:
+        # not before: a start that gets only what is left would take minutes where nothing is
+        _stand_back(stage)
     loop = _Loop(stage, work, waits=not setup.is_live)
     send(loop.progress())
     threading.Thread(target=loop.read, args=(daemon, send), daemon=True).start()
@@ -185,11 +187,18 @@ class _Loop:
 
 
 def _stand_back(stage: Stage) -> None:
-    """Take the lowest priorities, which a flight's path needs, but nobody who waits for all."""
-    if stage.nice > NICE_WITHOUT_LOSS:
-        os.nice(min(stage.nice, LOWEST_NICE) - NICE_WITHOUT_LOSS)
-    if stage.nice > LOWEST_NICE:
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    """Take the lowest priorities, which a flight's path needs, but nobody who waits for all.
+
+    The kernel keeps them by thread, and drivers have theirs by now.
+    """
+    nicer = min(stage.nice, LOWEST_NICE) - NICE_WITHOUT_LOSS
+    if nicer <= 0:
+        return
+    for thread in map(int, os.listdir("/proc/self/task")):
+        with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+            os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + nicer)
+            if stage.nice > LOWEST_NICE:
+                os.sched_setscheduler(thread, os.SCHED_IDLE, os.sched_param(0))
 
 
 def _take_real_time() -> None:

@@ -9,8 +9,8 @@ from companion.runtime import stage_child, stages
 from tests.support.processes import tiny_stages
 
 stage_child.REPORT_EVERY_S = 0.05
-stages.STAGES = tiny_stages.STAGES  # type: ignore[assignment]
-for stage in tiny_stages.STAGES:
+stages.STAGES = (*tiny_stages.STAGES, tiny_stages.LEFT_OVER)  # type: ignore[assignment]
+for stage in stages.STAGES:
     sys.modules[f"companion.stages.{stage.name}_work"] = tiny_stages
 
 if __name__ == "__main__":

@@ -33,8 +33,9 @@ ERRORS = {
 
 @dataclass(frozen=True, slots=True)
 class Do:
-    """What a stage is to do: `say`, `say much`, `remark`, `hang`, `exit`, `crash`, `give up`,
-    `raise` one of `ERRORS`, `drive`, or at its end `be slow to finish`, `fail to finish`."""
+    """What a stage is to do: `say`, `say much`, `say how it began`, `remark`, `hang`, `exit`,
+    `crash`, `give up`, `raise` one of `ERRORS`, `drive`, or at its end `be slow to finish`, `fail
+    to finish`."""
 
     t_ns: int
     what: str
@@ -56,6 +57,9 @@ SOURCE = Stage(
 READER = Stage("reader", (Frame, Do, MapUpdate), nice=1, frames=Frames.EVERY)
 WRITER = Stage("writer", (Said, MapUpdate), nice=1, with_flight=True, in_folder=True)
 STAGES = SOURCE, READER, WRITER
+"""Of a flight;"""
+LEFT_OVER = Stage("left over", (Do,), nice=20)
+"""and one more."""
 
 
 class TinyWork(Work):
@@ -66,10 +70,12 @@ class TinyWork(Work):
         if setup.folder is not None and setup.folder.name == UNUSABLE:
             raise InputError(f"{setup.folder}: cannot be used")
         self._tell: Callable[[Any], None] = print
-        self._at_the_end = ""
+        self._at_the_end = self._began_as = ""
 
     def begin(self, tell: Callable[[Any], None]) -> None:
         self._tell = tell
+        self._began_as = f"policy {os.sched_getscheduler(0)}, nice {os.nice(0)}"
+        threading.Thread(target=threading.Event().wait, name="driver", daemon=True).start()
 
     def step(self, message: Any) -> Iterator[Any]:
         if isinstance(message, Do):
@@ -90,6 +96,8 @@ class TinyWork(Work):
             yield Said(what.t_ns, "told", what.detail)
         elif what.what == "say much":
             yield from [Said(what.t_ns, "told", what.detail * 20_000)] * 30
+        elif what.what == "say how it began":
+            yield Said(what.t_ns, "began", self._began_as)
         elif what.what == "remark":
             self._tell(Remark(what.detail))
         elif what.what == "raise":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import signal
 import socket
 import threading
@@ -22,12 +23,20 @@ from companion.runtime.parcel import Parcel
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import DriverAtWork, Finish, Progress, Setup
 from companion.runtime.stage_start import NOT_STARTED, UNKNOWN_STATUS, Child, start_alone
-from companion.runtime.stages import QUEUE_BYTES, UNREAD_BYTES, Stage
+from companion.runtime.stages import NICE_WITHOUT_LOSS, QUEUE_BYTES, UNREAD_BYTES, Stage
 from companion.telemetry import ArmedSample
 from companion.timing.clock import monotonic_s
 from tests.support.flights.topic_flight import CAMERA
 from tests.support.processes.stage_heard import SOON_S, Heard
-from tests.support.processes.tiny_stages import GIVEN_UP, READER, SOURCE, UNUSABLE, Do, Said
+from tests.support.processes.tiny_stages import (
+    GIVEN_UP,
+    LEFT_OVER,
+    READER,
+    SOURCE,
+    UNUSABLE,
+    Do,
+    Said,
+)
 
 SETUP = Setup(Config(), CAMERA)
 SIZE = 480, 640
@@ -224,6 +233,19 @@ def test_a_driver_is_blamed_for_an_end_that_is_known(status: int, is_blamed: boo
     ended.until(lambda: ended.all)
     assert (process.driver is not None) is is_blamed
     process.kill()
+
+
+def test_what_gets_the_time_that_is_left_over_gets_more_to_begin(start: Start) -> None:
+    """Else it would take minutes where nothing is left over; then its drivers stand back, too."""
+    tiny = start(LEFT_OVER)
+    tiny.stage.begin(SETUP)
+    tiny.do("say how it began")
+    tiny.heard.until_said(
+        "began", f"policy {os.SCHED_OTHER}, nice {os.nice(0) + NICE_WITHOUT_LOSS}"
+    )
+    threads = psutil.Process(tiny.process.pid).threads()
+    assert len(threads) > 3
+    assert {os.sched_getscheduler(each.id) for each in threads} == {os.SCHED_IDLE}
 
 
 def test_how_long_it_has_hung_and_its_end_by_interruption(start: Start) -> None:
