@@ -11,6 +11,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from companion.geometry.geodesy import GeoOrigin
 from companion.messages import (
     Frame,
     FrameOverdue,
+    FrameTracked,
     LandingTarget,
     MapUpdate,
     Message,
@@ -204,11 +206,10 @@ def _tracked_again(
                 if step.has_picture
                 else FrameOverdue(step.seq, step.t_ns)
             )
-            if given is None or given.seq != step.seq or step.n_samples > len(told.samples):
-                raise FlightError(
-                    f"frame {step.seq} was tracked, but its image or telemetry before it is "
-                    "missing in the recording"
-                )
+            if given is None or given.seq != step.seq:
+                raise _not_recorded(step, "its image", flight.recording.health)
+            if step.n_samples > len(told.samples):
+                raise _not_recorded(step, "telemetry before it", flight.recording.health)
             for sample in told.samples[n_taken : step.n_samples]:
                 stage.step(sample)
             n_taken = step.n_samples
@@ -224,6 +225,14 @@ def _tracked_again(
         stage.finish(adjust=False)
     progress.finish()
     return found
+
+
+def _not_recorded(step: FrameTracked, what: str, health: Mapping[str, Any]) -> FlightError:
+    """Error for a frame that cannot be tracked again, and the reason where the flight knew it."""
+    stages = health.get("health", {}).get("stages", ())
+    n_dropped = sum(each["n_dropped"] for each in stages if each["name"] == "recorder")
+    why = f": the recorder could not keep up, and dropped {n_dropped} messages" if n_dropped else ""
+    return FlightError(f"frame {step.seq} was tracked, but {what} is missing in the recording{why}")
 
 
 def _take_up(stage: LocalisationStage, told: Decisions, camera: Camera) -> None:
