@@ -11,11 +11,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from companion.runtime.gathered_samples import GatheredSamples, Samples
 from companion.runtime.parcel import Parcel, allow_descriptors
 from companion.runtime.stage_process import FRAME, StageProcess
 from companion.runtime.stage_protocol import Finish, SetLoadLevel, Setup
 from companion.runtime.stage_start import Start
 from companion.runtime.stages import START_S, Death, Stage
+from companion.telemetry import TELEMETRY, Telemetry
 from companion.timing.clock import monotonic_s
 
 MAP = "MapUpdate"
@@ -66,6 +68,7 @@ class InProcesses:
         self._lock = threading.Lock()
         self._map_lock = threading.Lock()
         """Held while a map is passed on: a stage never gets an older one after a newer one."""
+        self._samples = GatheredSamples(self._offer_samples)
         self._over = threading.Event()
         self._flies = False
         self._hurry_s: float | None = None
@@ -127,8 +130,16 @@ class InProcesses:
             self.by_name[stage.name] = process
             self._set_up(stage)
 
+    def take(self, message: Any) -> None:
+        """Pass a message to all stages that listen to it: a sample soon, with those beside it."""
+        if isinstance(message, TELEMETRY):
+            self._samples.put(message)
+        else:
+            self.publish(Parcel.of(message))
+
     def publish(self, parcel: Parcel) -> None:
-        """Pass a message to all stages that listen to it."""
+        """Pass a closed message to all stages that listen to it."""
+        self._samples.let_go()
         if parcel.kind != MAP:
             self._offer(parcel)
             return
@@ -143,11 +154,25 @@ class InProcesses:
             if parcel.kind != FRAME or name not in self.without_frames:
                 process.offer(parcel)
 
+    def _offer_samples(self, samples: list[Telemetry]) -> None:
+        whole: Parcel | None = None
+        for name, process in list(self.by_name.items()):
+            listens = self._listens[name]
+            heard = [each for each in samples if type(each).__name__ in listens]
+            if not heard or name in self.muted:
+                continue
+            if len(heard) < len(samples):
+                process.offer(_together(heard))
+                continue
+            whole = whole or _together(samples)
+            process.offer(whole)
+
     def order(self, name: str, control: Any) -> None:
         """Send a control message to a stage, if there is one of that name.
 
         A load level also holds for the process that takes its place.
         """
+        self._samples.let_go()
         if isinstance(control, SetLoadLevel):
             self._load_levels[name] = control
         if name in self.by_name:
@@ -182,6 +207,7 @@ class InProcesses:
 
         Returned are stages that did not in time, and what is known of why.
         """
+        self._samples.let_go()
         with self._lock:
             self._over.set()
         late: dict[str, str] = {}
@@ -283,6 +309,10 @@ class InProcesses:
             self._interrupted_at.add(driver.identity)
             return
         self._failed_devices[driver.identity] = f"{driver.named}: {why}"
+
+
+def _together(samples: list[Telemetry]) -> Parcel:
+    return Parcel.of(Samples(samples[0].t_ns, tuple(samples)))
 
 
 def pause_s(n_before: int) -> float:

@@ -158,12 +158,12 @@ class Parcel:
         to.sendmsg(self._packet(), with_it, flags)
 
     @classmethod
-    def send_together(cls, parcels: Sequence[Parcel], to: socket.socket, flags: int = 0) -> None:
+    def send_together(cls, parcels: Sequence[Parcel], to: socket.socket) -> None:
         """As `send`: one that is shared, or others of INLINE_BYTES together in one packet."""
         if len(parcels) == 1:
-            parcels[0].send(to, flags)
+            parcels[0].send(to)
         else:
-            to.send(b"".join(part for parcel in parcels for part in parcel._packet()), flags)
+            to.send(b"".join(part for parcel in parcels for part in parcel._packet()))
 
     def _packet(self) -> list[bytes | bytearray]:
         kind = self.kind.encode()

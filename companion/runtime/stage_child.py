@@ -31,6 +31,7 @@ from typing import Any  # noqa: E402
 
 from companion.messages import Frame  # noqa: E402
 from companion.runtime.collection_pause import garbage_collection_paused  # noqa: E402
+from companion.runtime.gathered_samples import Samples  # noqa: E402
 from companion.runtime.mailbox import Mailbox  # noqa: E402
 from companion.runtime.parcel import Parcel  # noqa: E402
 from companion.runtime.peak_memory import peak_memory_mb  # noqa: E402
@@ -181,8 +182,9 @@ class _Loop:
                 for out in work.finish(message):
                     send(out)
                 return
-            for given in work.step(message):
-                send(given)
+            for each in message.parts if isinstance(message, Samples) else (message,):
+                for given in work.step(each):
+                    send(given)
             self._n_done += isinstance(message, Frame)
 
 

@@ -9,17 +9,9 @@ from functools import cache
 from companion.runtime.mailbox import Mailbox
 from companion.runtime.parcel import INLINE_BYTES, Parcel
 from companion.runtime.stages import QUEUE_BYTES, UNREAD_BYTES, Frames, Stage, drop_policy
-from companion.telemetry import TELEMETRY
-from companion.timing.clock import monotonic_s
 
 GATHER_S = 0.05
-"""Small messages gather for this long, or until a frame;"""
-HELD_S = 0.02
-"""samples for localisation, which takes them with its next frame only, for this long: a frame never
-waits for more than a few of them to be opened."""
-MOST_HELD = 64
-"""Samples of some 200 bytes each: a packet holds INLINE_BYTES of them."""
-SAMPLES = {kind.__name__ for kind in TELEMETRY}
+"""Small messages gather for this long, or until a frame."""
 
 
 class StageOutbox:
@@ -36,9 +28,6 @@ class StageOutbox:
         )
         self._socket = to
         self._is_prompt = stage.frames is Frames.NEWEST
-        self._held: list[Parcel] = []
-        """Samples that gather for one packet."""
-        self._held_since_s = 0.0
         self._puts = threading.Lock()
         """Keeps what is sent at once in order with what waits."""
         self._n_sent = self._n_taken = 0
@@ -65,16 +54,8 @@ class StageOutbox:
             self._waiting.put(parcel)
             return
         with self._puts:
-            if parcel.kind not in SAMPLES:
-                self._let_go()
-                self._go([parcel])
-                return
-            now_s = monotonic_s()
-            if not self._held:
-                self._held_since_s = now_s
-            self._held.append(parcel)
-            if now_s - self._held_since_s >= HELD_S or len(self._held) >= MOST_HELD:
-                self._let_go()
+            if not (self._waiting.is_idle and self._is_sent(parcel)):
+                self._waiting.put(parcel)
 
     def close(self) -> None:
         """Take no more; what waits is sent."""
@@ -107,28 +88,16 @@ class StageOutbox:
             return f"nothing can be sent to it: {error.strerror}"
         return ""
 
-    def _let_go(self) -> None:
-        """Send the samples that have gathered."""
-        if self._held:
-            held, self._held = self._held, []
-            self._go(held)
-
-    def _go(self, parcels: list[Parcel]) -> None:
-        if not (self._waiting.is_idle and self._are_sent(parcels)):
-            for parcel in parcels:
-                self._waiting.put(parcel)
-
-    def _are_sent(self, parcels: list[Parcel]) -> bool:
-        """Send messages in one packet without waiting; whether they could be."""
-        first = parcels[0]
-        if first.is_shared and self._n_sent - self._n_taken > UNREAD_BYTES:
+    def _is_sent(self, parcel: Parcel) -> bool:
+        """Send a message without waiting; whether it could be."""
+        if parcel.is_shared and self._n_sent - self._n_taken > UNREAD_BYTES:
             return False
         try:
-            Parcel.send_together(parcels, self._socket, socket.MSG_DONTWAIT)
+            parcel.send(self._socket, socket.MSG_DONTWAIT)
         except OSError:  # full, or gone, of which the thread that sends will learn
             return False
-        if first.is_shared:
-            self._n_sent += first.n_bytes  # the thread that counts them else waits for a message
+        if parcel.is_shared:
+            self._n_sent += parcel.n_bytes  # the thread that counts them else waits for a message
         return True
 
     def _has_room(self, n_bytes: int) -> bool:

@@ -176,7 +176,7 @@ class LiveFlight:
             if message.t_ns - self._reads[0].t_ns >= GATHER_NS:
                 self._publish_reads()
         elif takes:
-            self._processes.publish(Parcel.of(message))
+            self._processes.take(message)
 
     def publish_health(self, health: Health, origin: GeoOrigin | None) -> None:
         """Send health to viewers and results once a second, and a changed world's origin."""
@@ -185,7 +185,7 @@ class LiveFlight:
         if not self._takes or health.t_ns - self._health_ns < HEALTH_EVERY_NS:
             return
         self._health_ns = health.t_ns
-        self._processes.publish(Parcel.of(health))
+        self._processes.take(health)
         if origin is not None:
             self.set_origin(origin)
 
@@ -193,7 +193,7 @@ class LiveFlight:
         """Tell the stages the world's origin, where it has changed."""
         if origin != self._origin:
             self._origin = origin
-            self._processes.publish(Parcel.of(origin))
+            self._processes.take(origin)
 
     @property
     def viewing(self) -> Viewing | None:
@@ -306,7 +306,7 @@ class LiveFlight:
         """Send the bytes of the link that have gathered, in one message for all."""
         if self._reads:
             reads, self._reads = self._reads, []
-            self._processes.publish(Parcel.of(LinkReads(reads[0].t_ns, tuple(reads))))
+            self._processes.take(LinkReads(reads[0].t_ns, tuple(reads)))
 
     def _setup(self, stage: Stage, n_restarted: int, failed_devices: dict[str, str]) -> Setup:
         folder = self.folder

@@ -18,7 +18,7 @@ from companion.messages import Frame, MapUpdate
 from companion.runtime.stage_protocol import DriverAtWork, Finish, Remark, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 from companion.runtime.stages import Death, Frames, Stage
-from companion.telemetry import ArmedSample
+from companion.telemetry import ArmedSample, LandedSample
 
 UNUSABLE = "unusable"
 """Name of a folder of which no stage can make anything."""
@@ -82,7 +82,7 @@ class TinyWork(Work):
             yield from self._do(message)
         elif isinstance(message, Frame):
             yield Said(message.t_ns, "frame", str(message.seq))
-        elif isinstance(message, ArmedSample):
+        elif isinstance(message, ArmedSample | LandedSample):
             yield Said(message.t_ns, "sample", str(message.t_ns))
         elif isinstance(message, SetLoadLevel):
             yield Said(0, "load", str(message.level))

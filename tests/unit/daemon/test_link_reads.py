@@ -13,7 +13,6 @@ from companion.daemon.flights import live_flight as module
 from companion.daemon.flights.live_flight import GATHER_NS, LiveFlight
 from companion.flight_notes import GateStep, LinkBytes, LinkReads
 from companion.messages import Warned
-from companion.runtime.parcel import Parcel
 from companion.stages import recorder_work
 from companion.telemetry import ArmedSample
 from companion.timing.clock import FlightClock
@@ -31,8 +30,8 @@ class Published:
 
     def fly(self) -> None: ...
 
-    def publish(self, parcel: Parcel) -> None:
-        self.all.append(parcel.open())
+    def take(self, message: Any) -> None:
+        self.all.append(message)
 
     def finish(self, _: Callable[..., Any]) -> dict[str, str]:
         self.all.append("finished")

@@ -17,14 +17,16 @@ import psutil
 import pytest
 
 from companion.config import Config
-from companion.messages import MapUpdate
-from companion.runtime import in_processes, stage_start
+from companion.messages import Frame, MapUpdate
+from companion.runtime import gathered_samples, in_processes, stage_start
+from companion.runtime.gathered_samples import Samples
 from companion.runtime.in_processes import LONGEST_WAIT_S, InProcesses, Supervisor, pause_s
 from companion.runtime.parcel import Parcel
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Finish, SetLoadLevel, Setup
 from companion.runtime.stage_start import Child, Start, start_alone
 from companion.runtime.stages import Stage
+from companion.telemetry import ArmedSample, LandedSample
 from tests.support.flights.topic_flight import CAMERA
 from tests.support.processes.stage_heard import SOON_S, Heard
 from tests.support.processes.tiny_stages import (
@@ -409,3 +411,44 @@ def test_without_a_flight_nothing_is_finished() -> None:
     assert flight.processes.finish(lambda stage: Finish(hurry=False)) == {}
     assert flight.heard.texts("last words") == []
     assert not any(psutil.pid_exists(pid) for pid in pids)
+
+
+def test_samples_gather_until_another_message(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = replace(READER, listens=(*READER.listens, ArmedSample, LandedSample))
+    flight = fly(replace(SOURCE, listens=(*SOURCE.listens, ArmedSample)), samples)
+    flight.until_up("source", "reader")
+    offered: dict[str, list[list[int]]] = {"source": [], "reader": []}
+    for name, kept in offered.items():
+        process = flight.process(name)
+
+        def note(
+            parcel: Parcel, kept: list[list[int]] = kept, process: StageProcess = process
+        ) -> None:
+            if parcel.kind == Samples.__name__:
+                kept.append([each.t_ns for each in parcel.open().parts])
+            StageProcess.offer(process, parcel)
+
+        monkeypatch.setattr(process, "offer", note)
+    monkeypatch.setattr(gathered_samples, "HELD_S", 60.0)
+    frame = Frame(1, 1, np.zeros((4, 6), np.uint8), np.zeros((4, 6, 3), np.uint8))
+    for t_ns in range(70):
+        flight.processes.take(ArmedSample(t_ns, True))
+    flight.processes.take(LandedSample(70, True))
+    flight.processes.publish(Parcel.of(frame))
+    assert offered["source"] == [list(range(64)), list(range(64, 70))]
+    assert offered["reader"] == [list(range(64)), list(range(64, 71))]
+    flight.heard.until(lambda: len(flight.heard.texts("frame")) == 2)
+    said = sorted(map(int, flight.heard.texts("sample")))
+    assert said == sorted([*range(70), *range(71)])
+    monkeypatch.setattr(gathered_samples, "HELD_S", 0.0)
+    flight.processes.take(ArmedSample(71, True))
+    flight.heard.until(lambda: flight.heard.texts("sample").count("71") == 2)
+
+
+def test_a_flight_ends_with_its_last_samples(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gathered_samples, "HELD_S", 60.0)
+    flight = fly(replace(SOURCE, listens=(*SOURCE.listens, ArmedSample)))
+    flight.until_up("source")
+    flight.processes.take(ArmedSample(7, True))
+    flight.processes.finish(lambda stage: Finish(hurry=False))
+    assert flight.heard.texts("sample") == ["7"]

@@ -18,13 +18,12 @@ import pytest
 
 from companion.config import Config
 from companion.messages import DepthMap, Frame
-from companion.runtime import stage_outbox, stage_start
+from companion.runtime import stage_start
 from companion.runtime.parcel import Parcel
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import DriverAtWork, Finish, Progress, Setup
 from companion.runtime.stage_start import NOT_STARTED, UNKNOWN_STATUS, Child, start_alone
 from companion.runtime.stages import NICE_WITHOUT_LOSS, QUEUE_BYTES, UNREAD_BYTES, Stage
-from companion.telemetry import ArmedSample
 from companion.timing.clock import monotonic_s
 from tests.support.flights.topic_flight import CAMERA
 from tests.support.processes.stage_heard import SOON_S, Heard
@@ -345,34 +344,6 @@ def test_whoever_has_a_message_for_localisation_sends_it(
     assert senders == [threading.current_thread()] * 2
     tiny.heard.until_said("frame", "7")
     assert tiny.stage.waiting_bytes == 0
-
-
-def test_samples_for_localisation_gather_until_a_frame(
-    start: Start, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tiny = start(SOURCE)
-    tiny.stage.begin(SETUP)
-    tiny.until_up()
-    while not tiny.process._outbox._waiting.is_idle:
-        threading.Event().wait(0.001)
-    packets: list[int] = []
-    send_together = Parcel.send_together
-
-    def counted(parcels: Sequence[Parcel], to: socket.socket, flags: int = 0) -> None:
-        packets.append(len(parcels))
-        send_together(parcels, to, flags)
-
-    monkeypatch.setattr(Parcel, "send_together", counted)
-    monkeypatch.setattr(stage_outbox, "HELD_S", 60.0)
-    for n in range(70):
-        tiny.stage.offer(Parcel.of(ArmedSample(n, True)))
-    tiny.stage.offer(frame(7))
-    assert packets == [64, 6, 1]
-    tiny.heard.until_said("frame", "7")
-    assert tiny.heard.texts("sample") == [str(n) for n in range(70)]
-    monkeypatch.setattr(stage_outbox, "HELD_S", 0.0)
-    tiny.stage.offer(Parcel.of(ArmedSample(70, True)))
-    tiny.heard.until_said("sample", "70")
 
 
 def test_what_waits_for_a_process_that_takes_nothing_is_bounded(start: Start) -> None:
