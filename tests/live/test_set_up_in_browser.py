@@ -26,6 +26,7 @@ from drivers.camera.pattern_camera import BODY_FROM_CAMERA
 from drivers.images.calibration_file import read_calibration
 from tests.support.browser import CHROMIUM, Browser
 from tests.support.cameras.board_pictures import CHARUCO, RADTAN, BoardPictures, placings
+from tests.support.cameras.http_camera import RATE_HZ
 from tests.support.processes.flying import source
 from tests.support.processes.paged import Paged
 from tests.support.waiting import until
@@ -103,7 +104,7 @@ def boards() -> Callable[[], Bytes]:
     pictures = BoardPictures(RADTAN, CHARUCO)
     # a coarse camera wants them near and much tilted
     views = [pictures.picture(each) for each in placings(24, tilt_deg=50.0, width=0.7)]
-    every = itertools.cycle([np.asarray(each, np.uint8) for each in views for _ in range(15)])
+    every = itertools.cycle([np.asarray(each, np.uint8) for each in views for _ in range(RATE_HZ)])
     return lambda: next(every)
 
 

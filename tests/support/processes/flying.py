@@ -27,7 +27,7 @@ from companion.geometry.transforms import Pose
 from tests.support.autopilot.fake_autopilot import FakeAutopilot
 from tests.support.autopilot.fake_flight import MadeUpFlight
 from tests.support.autopilot.received_poses import KINDS, Array, Poses, poses_of
-from tests.support.cameras.http_camera import HttpCamera, world_from_body
+from tests.support.cameras.http_camera import RATE_HZ, HttpCamera, world_from_body
 from tests.support.processes.daemon_process import PROGRAM, Daemon
 from tests.support.processes.strain import Strain
 from tests.support.waiting import PATIENCE_S
@@ -51,8 +51,8 @@ CEASE_S = 0.3
 """Poses that are no longer believed cease in this time,"""
 LATENCY_S = 0.06
 """on a machine that gives the pose of a frame in this."""
-N_FEATURES = 700
-"""Of pictures of a quarter of the usual size: the usual 1200 are a tenth of a core more."""
+N_FEATURES = 450
+"""Of pictures of a quarter of the usual size, which have hardly more than these."""
 
 
 class Flying:
@@ -68,9 +68,10 @@ class Flying:
         program: tuple[str, ...] = PROGRAM,
         path: PathOf = world_from_body,
         has_imu: bool = False,
+        camera_hz: int = RATE_HZ,
     ) -> None:
         self._path = path
-        self.camera = HttpCamera(on=camera_on, world_from_body=path)
+        self.camera = HttpCamera(on=camera_on, world_from_body=path, rate_hz=camera_hz)
         self.strain = Strain()
         # a rangefinder would tell the scale sooner, but no place to compare with the truth; and an
         # IMU is a tenth of a core, here and in the daemon, that what is measured does not need
@@ -83,7 +84,8 @@ class Flying:
         self._folder, self._program = folder, program
         self._settings = (
             "camera.source=network", f"camera.url={self.camera.url}",
-            f"camera.calibration={calibration}", f"link.url={self.autopilot.url}",
+            f"camera.rate_hz={camera_hz}", f"camera.calibration={calibration}",
+            f"link.url={self.autopilot.url}",
             "feedback.mode=odometry", "depth.enabled=false",
             f"expert.features.n_features={N_FEATURES}", *settings,
         )  # fmt: skip
