@@ -16,9 +16,9 @@ from pathlib import Path
 
 from companion.page.codes import Codes, read_codes
 from tests.support.autopilot.fake_wire import free_port
-from tests.support.cameras.http_camera import world_from_body
+from tests.support.cameras.http_camera import RATE_HZ, world_from_body
 from tests.support.processes.daemon_process import Daemon
-from tests.support.processes.flying import Flying, PathOf
+from tests.support.processes.flying import N_FEATURES, Flying, PathOf
 from tests.support.waiting import until
 
 FILE = """\
@@ -27,6 +27,7 @@ FILE = """\
 source = "network"
 url = "{camera}"
 calibration = "{calibration}"
+rate_hz = {rate_hz}
 
 [link]
 url = "{link}"
@@ -52,7 +53,10 @@ class Paged(Flying):
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self.config = folder / "companion.toml"
-        self._over_it = (f"page.listen=127.0.0.1:{self.port}", *settings)
+        self._over_it = (
+            f"page.listen=127.0.0.1:{self.port}", f"expert.features.n_features={N_FEATURES}",
+            *settings,
+        )  # fmt: skip
         self._depth = depth
         super().__init__(folder, url=f"udpout:127.0.0.1:{free_port()}", path=path)
         if not mounted:
@@ -62,7 +66,7 @@ class Paged(Flying):
         if not self.config.exists():
             text = FILE.format(
                 camera=self.camera.url, link=self.autopilot.url, depth=str(self._depth).lower(),
-                calibration=self._folder / "camera.json",
+                calibration=self._folder / "camera.json", rate_hz=RATE_HZ,
             )  # fmt: skip
             self.config.write_text(text, "utf-8")
         return Daemon(self._folder, *self._over_it, config=self.config)
