@@ -9,6 +9,7 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ class Flown:
 
     begins_unix_s: float = 0.0
     """When its first picture was due."""
+    strain: Strain = field(default_factory=Strain)
     crowding: float = 1.0
     """So many times more wanted a processor, on average, than there are: it drops frames then."""
     first_pose_allowed_s: float = 0.0
@@ -89,7 +91,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
         # the IMU is a tenth of a core, here and in the daemon, that the dense map shall have
         "expert.link.imu_hz=0",
     )  # fmt: skip
-    with Strain() as strain, Daemon(folder, *settings) as daemon:
+    with out.strain as strain, Daemon(folder, *settings) as daemon:
         daemon.until(lambda health: True, "it answers")
         autopilot = FakeAutopilot(
             "ardupilot", f"udpout:127.0.0.1:{udp_port}", RecordedFlight(SAMPLE)
@@ -169,9 +171,15 @@ def test_odometry_comes_at_thirty_hertz(flown: Flown) -> None:
     came_s = flown.poses.came_s
     gaps_s = np.diff(came_s)
     assert np.median(gaps_s) < 0.04
-    sending_s = gaps_s[gaps_s < 0.25].sum()
-    rate_hz = (gaps_s < 0.25).sum() / sending_s
-    print(f"{rate_hz:.1f} Hz for {sending_s:.1f} s of {came_s[-1] - came_s[0]:.1f} s")
+    sent = gaps_s < 0.25
+    sending_s = gaps_s[sent].sum()
+    # that the machine gave the sender no processor makes an interval longer, and none shorter
+    came_ns = np.round(1e9 * came_s).astype(int)
+    withheld_s = [flown.strain.withheld_s(*each) for each in pairwise(came_ns)]
+    paced_s = np.maximum(gaps_s - withheld_s, np.minimum(gaps_s, 1 / 30))
+    rate_hz = sent.sum() / paced_s[sent].sum()
+    print(f"{sent.sum() / sending_s:.1f} Hz, {rate_hz:.1f} Hz without what was withheld,"
+          f" for {sending_s:.1f} s of {came_s[-1] - came_s[0]:.1f} s")  # fmt: skip
     assert rate_hz > 29.0
     assert came_s[0] - flown.armed_ns * 1e-9 < flown.first_pose_allowed_s
     assert sending_s > 0.75 / flown.crowding * (came_s[-1] - came_s[0])
