@@ -31,7 +31,8 @@ def begun_again(flying: Flying) -> Iterator[Daemon]:
 
 def test_what_the_ground_has_switched_off_stays_off(tmp_path: Path) -> None:
     port = free_port(socket.SOCK_STREAM)
-    with Flying(tmp_path, f'router.clients=["tcpin:127.0.0.1:{port}"]') as flying:
+    clients = f'router.clients=["tcpin:127.0.0.1:{port}"]'
+    with Flying(tmp_path, clients, "recorder.enabled=false") as flying:
         flying.until_source("camera", "running")
         flying.until_source("autopilot", "running")
         flying.autopilot.arm()
@@ -73,7 +74,7 @@ def test_limits_wait_for_disarming(tmp_path: Path) -> None:
     config = tmp_path / "my.toml"
     config.write_text("[expert.feedback]\nmin_quality = 30\nmax_sigma_m = 1.0\nmax_jump_m = 1.0\n")
     port = free_port(socket.SOCK_STREAM)
-    settings = (f'router.clients=["tcpin:127.0.0.1:{port}"]',)
+    settings = (f'router.clients=["tcpin:127.0.0.1:{port}"]', "recorder.enabled=false")
     with Flying(tmp_path, *settings, start=False) as flying:
         flying.daemon._command += ["--config", str(config)]
         flying.start()

@@ -40,8 +40,8 @@ def clock_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def flying(tmp_path_factory: pytest.TempPathFactory, clock_set: Path) -> Iterator[Flying]:
     folder = tmp_path_factory.mktemp("autopilot")
     with Flying(
-        folder, "daemon.flight=always", url=f"pty:{folder}/flight_controller:921600",
-        program=("-c", JUMPS, str(clock_set)),
+        folder, "daemon.flight=always", "recorder.enabled=false",
+        url=f"pty:{folder}/flight_controller:921600", program=("-c", JUMPS, str(clock_set)),
     ) as begun:  # fmt: skip
         begun.until_source("autopilot", "running")
         begun.until_sending()

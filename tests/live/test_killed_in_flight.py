@@ -15,7 +15,7 @@ from tests.support.processes.flying import Flying
 
 
 def test_the_next_process_counts_on(tmp_path: Path) -> None:
-    with Flying(tmp_path, "daemon.flight=always") as flying:
+    with Flying(tmp_path, "daemon.flight=always", "recorder.enabled=false") as flying:
         flying.until_sending()
         assert flying.poses.resets[0] == 0
         os.kill(flying.daemon.pid, signal.SIGKILL)

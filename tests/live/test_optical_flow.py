@@ -56,7 +56,7 @@ def derotated(kind: str, received: list[Received]) -> tuple[Array, list[int]]:
 
 @pytest.mark.parametrize("kind", ["OPTICAL_FLOW", "OPTICAL_FLOW_RAD"])
 def test_the_autopilot_gets_the_flow(tmp_path: Path, kind: str) -> None:
-    settings = ("feedback.mode=off", f"feedback.flow={kind.lower()}")
+    settings = ("feedback.mode=off", f"feedback.flow={kind.lower()}", "recorder.enabled=false")
     with Flying(tmp_path, *settings) as flying:
         flying.autopilot.arm()
         flying.autopilot.wait_for(kind, 60, 90, lambda got: got.message.quality > 0)

@@ -28,12 +28,14 @@ from tests.support.autopilot.fake_autopilot import FakeAutopilot
 from tests.support.autopilot.fake_flight import MadeUpFlight
 from tests.support.autopilot.fake_wire import free_port
 from tests.support.processes.daemon_process import Daemon
+from tests.support.processes.flying import N_FEATURES
 from tests.support.processes.program import replay, replay_here
 from tests.support.processes.strain import Strain
 
 SETTINGS = (
     "camera.source=pattern", "camera.rate_hz=15", "camera.width=320", "camera.height=240",
     "depth.enabled=false", "daemon.flight=always", "expert.recorder.least_free_mb=0",
+    f"expert.features.n_features={N_FEATURES}",
 )  # fmt: skip
 OLDER_S = 1.0
 """What is older than this when all is killed is on the disk."""

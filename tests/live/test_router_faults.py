@@ -26,7 +26,8 @@ def port() -> int:
 
 @pytest.fixture(scope="module")
 def flying(tmp_path_factory: pytest.TempPathFactory, port: int) -> Iterator[Flying]:
-    settings = (f'router.clients=["tcpin:127.0.0.1:{port}"]', "expert.router.queue_kb=16")
+    clients = f'router.clients=["tcpin:127.0.0.1:{port}"]'
+    settings = clients, "expert.router.queue_kb=16", "recorder.enabled=false"
     with Flying(tmp_path_factory.mktemp("router"), *settings) as begun:
         begun.until_source("camera", "running")
         begun.until_source("autopilot", "running")

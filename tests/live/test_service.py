@@ -17,11 +17,12 @@ import pytest
 from companion.daemon.health_watch import PATIENCE_NS
 from companion.daemon.periodic_checks import NO_PROGRESS
 from tests.support.processes.daemon_process import Daemon
+from tests.support.processes.flying import N_FEATURES
 from tests.support.waiting import PATIENCE_S, until
 
 PATTERN = (
-    "camera.source=pattern", "camera.width=320", "camera.height=240", "camera.rate_hz=15",
-    "daemon.flight=always", "recorder.enabled=false",
+    "camera.source=pattern", "camera.width=320", "camera.height=240", "camera.rate_hz=10",
+    "daemon.flight=always", "recorder.enabled=false", f"expert.features.n_features={N_FEATURES}",
 )  # fmt: skip
 
 

@@ -29,7 +29,7 @@ from drivers.system.status_socket import ask_status
 from tests.support.processes.program import Run
 from tests.support.waiting import PATIENCE_S
 
-ASK_EVERY_S = 0.05
+ASK_EVERY_S = 0.1
 PROGRAM = ("-m", "companion")
 NO_GOVERNOR = """
 import sys
