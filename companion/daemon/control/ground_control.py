@@ -120,7 +120,10 @@ class GroundControl:
         self._kept: NewestFile | None = None
         self._new_map = NewMap(flights, daemon.prepare, daemon.begin_flight)
         self._snapshots = Snapshots(flights, self._tell)
-        self.way_back = WayBack(link, clock, lambda: daemon.armed, self._tell)
+        self.way_back = WayBack(
+            link, clock, lambda: daemon.armed, lambda: daemon.config.feedback.min_quality,
+            self._tell,
+        )  # fmt: skip
         commands = {
             MAPPING: Command(self._switch_mapping),
             NEW_MAP: Command(self._begin_new_map),

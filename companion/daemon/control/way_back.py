@@ -23,16 +23,18 @@ NOTHING: Array = np.empty((0, 3))
 class WayBack:
     """Odometry of the current flight in; waypoints from its newest place to the first out.
 
-    Each place is kept as it was believed when it was flown, while the camera saw its way and the
-    map had a place on the globe. A new map, or a crash of localisation, leaves them: they are of
-    the same origin. `tell` takes what the pilot is to know, its details, and whether it is good.
+    Each place is kept as it was believed when it was flown, while the camera saw its way, the pose
+    was good enough to be sent and the map had a place on the globe. A new map, or a crash of
+    localisation, leaves them: they are of the same origin. `tell` takes what the pilot is to know,
+    its details, and whether it is good.
     """
 
     def __init__(
         self, link: AutopilotLink, clock: FlightClock, armed: Callable[[], bool],
-        tell: Callable[[PilotText, str, bool], None],
+        min_quality: Callable[[], int], tell: Callable[[PilotText, str, bool], None],
     ) -> None:  # fmt: skip
         self._link, self._clock, self._armed, self._tell = link, clock, armed, tell
+        self._min_quality = min_quality
         self._was_armed = False
         self._placed: Georeference | None = None
         self._path = ThinnedPath()
@@ -52,6 +54,8 @@ class WayBack:
         self._was_armed = armed
         is_placed = self._placed is not None and self._placed.has_origin and origin is not None
         if not armed or not is_placed or pose is None or odometry.state is not TrackState.TRACKING:
+            return
+        if odometry.quality < self._min_quality():
             return
         if origin != self._origin:
             self._begin(origin)

@@ -21,6 +21,7 @@ from tests.support.autopilot.ground_station import asked
 from tests.support.autopilot.memory_port import MemoryPort
 
 ORIGIN = GeoOrigin(47.3977, 8.5456, 488.0)
+MIN_QUALITY = 20
 ARDUPILOT, PX4 = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4
 
 
@@ -52,8 +53,9 @@ class Flown:
             asked(mavlink.MAVLink_heartbeat_message(2, autopilot, 0, 0, 4, 3), 1, 1)
         )
         self.way = WayBack(
-            self.link, Clock(), lambda: self.armed, lambda *told: self.told.append(told)
-        )
+            self.link, Clock(), lambda: self.armed, lambda: MIN_QUALITY,
+            lambda *told: self.told.append(told),
+        )  # fmt: skip
         self.place(True)
 
     def place(self, has_origin: bool) -> None:
@@ -61,10 +63,13 @@ class Flown:
         found = Georeference(world, 0.0, 0.0, "positions", 50, 0.4, has_origin)
         self.way.take_georeference(Georeferenced(0, found))
 
-    def fly(self, path: Array, state: TrackState = TrackState.TRACKING, known: bool = True) -> None:
+    def fly(
+        self, path: Array, state: TrackState = TrackState.TRACKING, known: bool = True,
+        quality: int = MIN_QUALITY,
+    ) -> None:  # fmt: skip
         for n, place in enumerate(path):
             pose = Pose(np.eye(3), place) if known else None
-            self.way.take_odometry(Odometry(n, n, state, 0, 50, pose, np.zeros(3), 0.1))
+            self.way.take_odometry(Odometry(n, n, state, 0, quality, pose, np.zeros(3), 0.1))
 
     def waypoints(self) -> Array:
         """In NED at the origin."""
@@ -127,11 +132,15 @@ def lost(flown: Flown) -> None:
     flown.fly(OUT, TrackState.LOST)
 
 
+def poor(flown: Flown) -> None:
+    flown.fly(OUT, quality=MIN_QUALITY - 1)
+
+
 def unknown(flown: Flown) -> None:
     flown.fly(OUT, known=False)
 
 
-@pytest.mark.parametrize("how", [without_place, without_map, without_origin, lost, unknown])
+@pytest.mark.parametrize("how", [without_place, without_map, without_origin, lost, poor, unknown])
 def test_what_has_no_place_is_no_way_back(how: Callable[[Flown], None]) -> None:
     flown = Flown()
     flown.armed = True
