@@ -124,8 +124,8 @@ def test_mapping_is_left_and_taken_up(flying: Flying, ground: GroundStation) -> 
     flying.until_stage("depth", lambda found: found["n"] > 0, MAP_S)
     assert ground.command(MAPPING, 0.0) == [ACCEPTED]
     flying.until_stage("depth", lambda found: found["detail"] == "switched off")
-    time.sleep(1.5)
-    n_done = flying.until_stage("depth", lambda found: True)["n"]
+    # it works off what waits, with the time that is left over
+    n_done = flying.until_stage("depth", lambda found: found["waiting_mb"] == 0)["n"]
     time.sleep(1.0)
     assert flying.until_stage("depth", lambda found: True)["n"] <= n_done + 5
     assert ground.command(MAPPING, 1.0) == [ACCEPTED]
