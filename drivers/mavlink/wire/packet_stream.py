@@ -1,13 +1,14 @@
-"""Packet framing: finds MAVLink packets in a byte stream, without decoding them.
+"""Packet framing: finds MAVLink packets in a byte stream, whose checksums it validates once.
 
-pymavlink decodes (`decode`), but only packets with a reader.
+`decode` makes messages of them: of numbers, as nearly all of an autopilot's are, by the tables of
+pymavlink; of text by its codec.
 """
 
 from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -77,9 +78,44 @@ def decode(codec: mavlink.MAVLink, packet: Packet) -> Any | None:
     if not packet.known:
         return None
     try:
-        return codec.decode(bytearray(packet.raw))
+        read = READERS.get(packet.message_id)
+        return codec.decode(bytearray(packet.raw)) if read is None else read(packet)
     except (mavlink.MAVError, struct.error, ValueError, IndexError, TypeError):
         return None
+
+
+def _reader_of(kind: type[mavlink.MAVLink_message]) -> Callable[[Packet], Any]:
+    """Reader of a message of numbers: as pymavlink's, without its second look at the checksum."""
+    unpack, size = kind.unpacker.unpack, kind.unpacker.size
+    begins = [sum(kind.lengths[:order]) for order in kind.orders]
+    counts = [kind.lengths[order] for order in kind.orders]
+    places = [
+        begin if count == 1 else slice(begin, begin + count)
+        for begin, count in zip(begins, counts, strict=True)
+    ]
+    arrays = [at for at, count in enumerate(counts) if count > 1]
+
+    def read(packet: Packet) -> Any:
+        numbers = unpack(packet.payload[:size].ljust(size, b"\0"))
+        values: list[Any] = [numbers[place] for place in places]
+        for at in arrays:
+            values[at] = list(values[at])
+        message: Any = kind(*values)
+        header = message.get_header()
+        header.mlen, header.seq = packet.raw[1], packet.seq
+        header.srcSystem, header.srcComponent = packet.system, packet.component
+        message.get_msgbuf().extend(packet.raw)
+        return message
+
+    return read
+
+
+READERS = {
+    message_id: _reader_of(kind)
+    for message_id, kind in mavlink.mavlink_map.items()
+    if b"c" not in kind.native_format
+}
+"""Readers of messages without text, by id."""
 
 
 class MavlinkStream:
