@@ -14,14 +14,17 @@ from types import TracebackType
 from typing import Any
 from urllib.parse import urlsplit
 
+from companion.page.doctor_process import LONGEST_S
+
 CHROMIUM = Path("/usr/bin/chromium")
 FLAGS = (
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
 """So that it asks nothing of the network by itself."""
-WAIT_MS = 60_000
-"""Longest wait for what a page is to show: half a minute has not been enough on a busy machine."""
+WAIT_MS = round(1e3 * (LONGEST_S + 10.0))
+"""Longest wait for what a page is to show: of all that it shows the findings of the doctor take
+longest, and how long it waits for these itself it says."""
 
 
 class Browser:
