@@ -67,8 +67,11 @@ def main() -> int:
     return run(sys.argv[1], int(sys.argv[2]))
 
 
-def run(name: str, descriptor: int) -> int:
-    """Run one stage until told to finish, or until the daemon is gone; the exit status."""
+def run(name: str, descriptor: int, ready: Callable[[], None] = lambda: None) -> int:
+    """Run one stage until told to finish, or until the daemon is gone; the exit status.
+
+    `ready` is called once it takes messages.
+    """
     Path("/proc/self/comm").write_text(name, "utf-8")  # its name in top and ps
     stage = stage_named(name)
     os.nice(min(stage.nice, NICE_WITHOUT_LOSS))
@@ -86,7 +89,7 @@ def run(name: str, descriptor: int) -> int:
     if not setup.is_live:
         stage = lossless(stage)
     try:
-        _serve(daemon, send, stage, module, setup)
+        _serve(daemon, send, stage, module, setup, ready)
     except BaseException as error:
         failed = Failed.by(error)
         if not failed.is_foreseen:
@@ -106,7 +109,7 @@ def imported(name: str) -> WorkModule:
 
 def _serve(
     daemon: socket.socket, send: Callable[[Any], None], stage: Stage, module: WorkModule,
-    setup: Setup,
+    setup: Setup, ready: Callable[[], None],
 ) -> None:  # fmt: skip
     work = module.work(setup)
     work.begin(send)
@@ -115,6 +118,7 @@ def _serve(
         _stand_back(stage)
     loop = _Loop(stage, work, waits=not setup.is_live)
     send(loop.progress())
+    ready()
     threading.Thread(target=loop.read, args=(daemon, send), daemon=True).start()
     threading.Thread(target=loop.report, args=(send,), name="reports", daemon=True).start()
     loop.run(send)

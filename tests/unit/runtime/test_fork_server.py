@@ -101,6 +101,34 @@ def test_a_prepared_stage_that_has_died_is_started_anew(server: ForkServer) -> N
     viewers.stage.kill()
 
 
+@pytest.mark.parametrize("end", ["ready", "dead"])
+def test_other_stages_start_once_that_of_the_pose_is(
+    server: ForkServer, end: str, tmp_path: Path
+) -> None:
+    server.prepare("localisation")
+    process = psutil.Process(server.pid)
+    until(lambda: len(process.children()) == 1)
+    (waiting,) = process.children()
+    waiting.suspend()  # in its imports
+    pose = StageProcess(
+        stage_named("localisation"), server.start, lambda parcel: None, lambda why: None
+    )
+    until(lambda: pose.pid == waiting.pid)
+    viewers = Viewers(server)
+    pose.begin(Setup(Config(), CAMERA, tmp_path))
+    server.prepare("recorder")  # asked for after viewers, whose turn has thus come
+    until(lambda: len(process.children()) == 2)
+    assert viewers.stage.pid is None
+    if end == "dead":
+        waiting.kill()
+    else:
+        waiting.resume()
+    viewers.begin()
+    assert end == "dead" or pose.progress is not None
+    for stage in (viewers.stage, pose):
+        stage.kill()
+
+
 def test_a_prepared_stage_that_nobody_starts_ends_with_the_server() -> None:
     with ForkServer() as server:
         server.prepare("viewers")
