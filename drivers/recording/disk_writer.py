@@ -95,7 +95,8 @@ class DiskWriter:
             else:
                 self._entries.append(entry)
                 self._n_waiting += len(entry.data)
-                self._changed.notify()
+                if self._has_enough():  # to wake the thread for each costs more than to queue it
+                    self._changed.notify()
                 return True
         if too_slow:
             self._tell_once(SLOW, f"{self._most >> 20} MB wait for it")

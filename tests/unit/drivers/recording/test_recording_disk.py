@@ -1,6 +1,7 @@
 import errno
 import os
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +14,7 @@ from companion.errors import FlightError, StageError
 from companion.flight_notes import LinkBytes
 from companion.messages import Frame, Warned
 from drivers.recording import disk_writer
-from drivers.recording.disk_writer import CHUNK_BYTES, FULL, PRUNED, RESERVE_BYTES, SLOW
+from drivers.recording.disk_writer import CHUNK_BYTES, FULL, PRUNED, RESERVE_BYTES, SLOW, DiskWriter
 from drivers.recording.flights_folder import UNARMED, flights_in, flown_in, may_go
 from drivers.recording.mcap_writer import McapWriter
 from drivers.recording.recorder import Recorder
@@ -171,6 +172,24 @@ def test_a_slow_disk_makes_nobody_wait_and_costs_pictures_first(
     flight = opened(tmp_path / "2026-01-01T00-00-00Z")
     assert flight.n_frames == 150 - recorder.n_dropped["pictures"]
     assert flight.recording.counts["/mavlink/received"] == 150
+
+
+def test_small_messages_do_not_wake_the_thread_that_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[int] = []
+    has_enough = DiskWriter._has_enough
+
+    def looked(writer: DiskWriter) -> bool:
+        if threading.current_thread() is writer._thread:
+            looks.append(len(looks))
+        return has_enough(writer)
+
+    monkeypatch.setattr(DiskWriter, "_has_enough", looked)
+    recorder = recorder_in(tmp_path / "2026-01-01T00-00-00Z", flush_s=60.0)
+    assert fly(recorder, 30, 0.002) == []
+    assert len(looks) < 10
+    assert opened(tmp_path / "2026-01-01T00-00-00Z").n_frames == 30
 
 
 def test_what_was_never_armed_goes_first(tmp_path: Path) -> None:
