@@ -19,6 +19,8 @@ from companion.streaming.viewer.drawing import Drawing
 from companion.streaming.viewer.rrd_files import RrdFiles
 
 CAPACITY_BYTES = 64 << 20
+GATHER_S = 0.1
+"""Messages gather for this long: nobody waits for the file."""
 NICE = 5
 """Of its thread, which in Linux has a priority of its own: what is shown waits for the path."""
 
@@ -66,8 +68,9 @@ class FileViewer:
             colours = Colours(self._config.colours)
             drawing = Drawing(self._files.recording, live=False, colours=colours)
             drawing.draw(self._encoder.flight)
-            while (message := self._waiting.get()) is not None:
-                self._draw(drawing, self._encoder.take(message))
+            while messages := self._waiting.collect(CAPACITY_BYTES // 8, GATHER_S):
+                for message in messages:
+                    self._draw(drawing, self._encoder.take(message))
             self._draw(drawing, self._encoder.close())
         except BaseException as fault:
             self._fault = fault
