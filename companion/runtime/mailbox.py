@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from enum import IntEnum
 from typing import Generic, TypeVar
 
@@ -68,22 +68,14 @@ class Mailbox(Generic[T]):
 
     def put(self, message: T) -> None:
         """Add a message; see `waits`. Counted as dropped once it is closed."""
-        policy, size = self._policy_of(message), self._bytes_of(message)
+        self.put_all((message,))
+
+    def put_all(self, messages: Iterable[T]) -> None:
+        """As `put` of each; whoever waits for them is woken once."""
         with self._changed:
-            if self._is_lossless:
-                self._changed.wait_for(lambda: self._closed or self._has_room(size))
-            if self._closed:
-                self.n_overflowed += 1
-                return
-            if policy is DropPolicy.LATEST_WINS and self._waiting[policy]:
-                self._drop(policy)
-                self.n_dropped += 1
-            self._waiting[policy].append((self._n_put, size, message))
-            self._n_put += 1
-            self.n_bytes += size
-            while self.n_bytes > self._capacity_bytes and self._drop_lowest():
-                self.n_overflowed += 1
-            if not self._pauses or policy is not GATHERED or self.n_bytes > self._gather_bytes:
+            for message in messages:
+                self._put(message)
+            if not self._pauses or self._is_urgent():
                 self._changed.notify_all()
 
     def get(self) -> T | None:
@@ -135,6 +127,23 @@ class Mailbox(Generic[T]):
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+
+    def _put(self, message: T) -> None:
+        policy, size = self._policy_of(message), self._bytes_of(message)
+        if self._is_lossless and not self._has_room(size):
+            self._changed.notify_all()  # of those before it
+            self._changed.wait_for(lambda: self._closed or self._has_room(size))
+        if self._closed:
+            self.n_overflowed += 1
+            return
+        if policy is DropPolicy.LATEST_WINS and self._waiting[policy]:
+            self._drop(policy)
+            self.n_dropped += 1
+        self._waiting[policy].append((self._n_put, size, message))
+        self._n_put += 1
+        self.n_bytes += size
+        while self.n_bytes > self._capacity_bytes and self._drop_lowest():
+            self.n_overflowed += 1
 
     def _has_room(self, size: int) -> bool:
         return not self.n_bytes or self.n_bytes + size <= self._capacity_bytes

@@ -33,7 +33,7 @@ from companion.messages import Frame  # noqa: E402
 from companion.runtime.collection_pause import garbage_collection_paused  # noqa: E402
 from companion.runtime.gathered_samples import Samples  # noqa: E402
 from companion.runtime.mailbox import Mailbox  # noqa: E402
-from companion.runtime.parcel import Parcel  # noqa: E402
+from companion.runtime.parcel import INLINE_BYTES, Parcel  # noqa: E402
 from companion.runtime.peak_memory import peak_memory_mb  # noqa: E402
 from companion.runtime.stage_protocol import (  # noqa: E402
     Failed,
@@ -143,11 +143,11 @@ class _Loop:
         n_taken = 0
         try:
             while True:
-                for parcel in Parcel.receive(daemon):
-                    if parcel.is_shared:
-                        n_taken += parcel.n_bytes
-                        send(Taken(n_taken))
-                    self._inbox.put(parcel)
+                parcels = Parcel.receive(daemon)
+                if parcels[0].is_shared:  # which comes alone
+                    n_taken += parcels[0].n_bytes
+                    send(Taken(n_taken))
+                self._inbox.put_all(parcels)
         except (OSError, EOFError):
             if not self._work.outlives_daemon:
                 os._exit(0)  # the daemon is gone, and nobody waits for results
@@ -175,13 +175,13 @@ class _Loop:
     def run(self, send: Callable[[Any], None]) -> None:
         """Work until told to finish."""
         work = self._work
+        parcels: list[Parcel] = []
         while True:
-            self._busy_since_s = None
-            parcel = self._inbox.get()
-            assert parcel is not None  # it is never closed
+            if not parcels:
+                self._busy_since_s = None
+                parcels = self._inbox.collect(INLINE_BYTES, 0.0)
             self._busy_since_s = monotonic_s()
-            message = parcel.open()
-            del parcel
+            message = parcels.pop(0).open()
             if isinstance(message, Finish):
                 for out in work.finish(message):
                     send(out)

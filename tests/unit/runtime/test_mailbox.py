@@ -155,6 +155,34 @@ def test_small_messages_gather_no_longer_than_that() -> None:
     assert [name for _, _, name in box.collect(30, 0.05)] == ["1"]
 
 
+def test_what_is_put_together_is_there_before_anybody_is_woken() -> None:
+    box = mailbox(1000)
+    taken: list[list[Sent]] = []
+    taker = threading.Thread(target=lambda: taken.append(box.collect(1000, 0.0)))
+    taker.start()
+    while not box.is_idle:
+        taker.join(0.001)
+    several = [(SMALL, 10, str(number)) for number in range(50)]
+    box.put_all(several)
+    taker.join()
+    assert taken == [several]
+
+
+def test_putting_together_waits_for_room_and_wakes_who_makes_it() -> None:
+    box: Mailbox[Sent] = Mailbox(lambda sent: sent[0], lambda sent: sent[1], 100, waits=True)
+    several = [(SMALL, 40, str(number)) for number in range(10)]
+    putter = threading.Thread(target=box.put_all, args=(several,))
+    taken: list[Sent | None] = []
+    taker = threading.Thread(target=lambda: taken.extend(box.get() for _ in several))
+    taker.start()
+    while not box.is_idle:
+        taker.join(0.001)
+    putter.start()
+    taker.join(LONG_S / 2)
+    assert taken == several
+    putter.join()
+
+
 def test_it_is_idle_while_somebody_waits_for_the_next_message() -> None:
     box = mailbox()
     assert not box.is_idle, "nobody takes anything"
