@@ -137,6 +137,7 @@ class LocalisationStage:
         self._tracker.atlas.loop_allowed = self._loop_allowed
         self._georeferences.begun.reckoned_at = self._smooth.reckoning.path.at
         self._tracker.atlas.displacements_of = self._georeferences.displacements_of
+        self._tracker.atlas.georeference_of = self._georeferences.of
         self._site = SiteInFlight(site, self._tracker, self._georeferencer, self._georeferences)
 
     @property

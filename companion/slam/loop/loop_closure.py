@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.geometry.transforms import Array, Pose, Similarity, angle_between
+from companion.messages import Georeference
 from companion.slam.loop.place_recognition import KeyframeDatabase
 from companion.slam.loop.relocalizer import (
     LOW_FOUND_RATIO,
+    MIN_FOUND,
     MIN_FOUND_RATIO,
     Relocalised,
     Relocalizer,
@@ -49,6 +51,7 @@ class LoopClosure:
     here_from_there: Similarity
 
 
+PlaceOf = Callable[[SlamMap], Georeference | None]
 LoopCheck = Callable[[LoopClosure, bool], bool]
 """Test of a loop closure by other measurements; its second argument is True within one map."""
 
@@ -98,6 +101,40 @@ class LoopDetector:
                 return found
         return None
 
+    def find_placed(
+        self, keyframe: Keyframe, here: SlamMap, maps: list[SlamMap], georeference_of: PlaceOf,
+        check: LoopCheck,
+    ) -> LoopClosure | None:  # fmt: skip
+        """A confirmed loop closure with another map that lies about there in the world, or None.
+
+        In faint pictures a tenth of the points is found again, as on another day: of a place that
+        other measurements tell, it is enough that chance finds a third of that.
+        """
+        placed = georeference_of(here)
+        for there in maps:
+            other = georeference_of(there)
+            if not (placed and placed.has_origin and other and other.has_origin):
+                continue
+            there_from_here = other.world_from_map.inverse() @ placed.world_from_map
+            expected = camera_from_there(keyframe.camera_from_map, there_from_here.inverse())
+            for key in self._in_view(there, expected):
+                found = self._try(keyframe, here, there.keyframes[key], there, None)
+                if found is not None and check(found, False):
+                    return found
+        return None
+
+    def _in_view(self, there: SlamMap, camera_from_map: Pose) -> list[int]:
+        """Keyframes nearest to a camera that look alike and show what is in its view."""
+        near = there.nearest(camera_from_map.inverse().translation, N_CANDIDATES, set())
+        return [
+            key
+            for key in near
+            if there.keyframes[key].camera_from_map.rotation[2] @ camera_from_map.rotation[2]
+            > SAME_VIEW
+            and self._relocalizer.n_in_view(there, there.keyframes[key], camera_from_map)
+            > MIN_FOUND
+        ]
+
     def _candidates(
         self, keyframe: Keyframe, near: set[int], here: SlamMap, maps: list[SlamMap]
     ) -> list[int]:
@@ -111,11 +148,16 @@ class LoopDetector:
 
     def _try(
         self, keyframe: Keyframe, here: SlamMap, other: Keyframe, there: SlamMap,
-        share: float = MIN_FOUND_RATIO,
+        share: float | None = MIN_FOUND_RATIO,
     ) -> LoopClosure | None:  # fmt: skip
         level = keyframe.camera_from_map.rotation.T if here.level and there.level else None
         relocalised = self._relocalizer.relocalise(
-            keyframe.features, there, other, level, keyframe.keyframe_id
+            keyframe.features,
+            there,
+            other,
+            level,
+            keyframe.keyframe_id,
+            None if share is None else MIN_FOUND_RATIO,
         )
         if relocalised is None:
             return None
@@ -138,7 +180,7 @@ class LoopDetector:
         other: Keyframe,
         there: SlamMap,
         here_from_there: Similarity,
-        share: float,
+        share: float | None,
     ) -> int:
         """Number of covisible neighbours verified in the other part, by that share of points."""
         _, ids = here.observations_of(keyframe)

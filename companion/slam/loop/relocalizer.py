@@ -58,7 +58,7 @@ class Relocalizer:
 
     def relocalise(
         self, features: Features, slam_map: SlamMap, keyframe: Keyframe,
-        level_from_camera: Array | None, seed: int, share: float = MIN_FOUND_RATIO,
+        level_from_camera: Array | None, seed: int, share: float | None = MIN_FOUND_RATIO,
     ) -> Relocalised | None:  # fmt: skip
         """Relocalise an image in a map against a candidate keyframe; None if uncertain.
 
@@ -78,18 +78,18 @@ class Relocalizer:
         )  # fmt: skip
         if inlier.sum() < MIN_INLIERS:
             return None
-        if level_from_camera is None and inlier.sum() >= MANY_INLIERS:
+        if share is not None and level_from_camera is None and inlier.sum() >= MANY_INLIERS:
             share = min(share, LOW_FOUND_RATIO)
         return self.verify(features, slam_map, keyframe, pose, share)
 
     def verify(
         self, features: Features, slam_map: SlamMap, keyframe: Keyframe, pose: Pose,
-        share: float = MIN_FOUND_RATIO,
+        share: float | None = MIN_FOUND_RATIO,
     ) -> Relocalised | None:  # fmt: skip
         """Match the points predicted around a keyframe; None where less than `share` is found.
 
-        For images with few features the number required is capped at half of them. Of a keyframe
-        of an earlier flight the number required is a multiple of what chance finds instead.
+        For images with few features the number required is capped at half of them. Without a share,
+        and of a keyframe of an earlier flight, it is a multiple of what chance finds instead.
         """
         ids = covisible_points(slam_map, keyframe)
         points, found = np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -105,13 +105,18 @@ class Relocalizer:
                 features.normalised[found], features.whitening[found],
             )  # fmt: skip
             points, found = points[inlier], found[inlier]
-        if keyframe.keyframe_id in slam_map.held:
+        if share is None or keyframe.keyframe_id in slam_map.held:
             n_required = CHANCE_RATIO * self._found_by_chance(features, slam_map, pose, ids)
         else:
             n_required = share * min(n_due, len(features) // 2)
         if len(points) < max(MIN_FOUND, n_required):
             return None
         return Relocalised(pose, points, found, keyframe)
+
+    def n_in_view(self, slam_map: SlamMap, keyframe: Keyframe, camera_from_map: Pose) -> int:
+        """Number of points about a keyframe that are in the view of a camera."""
+        points = covisible_points(slam_map, keyframe)
+        return len(self._projector.visible(slam_map, camera_from_map, points).ids)
 
     def _found_by_chance(self, features: Features, slam_map: SlamMap, pose: Pose, ids: Ints) -> int:
         """Number of points found where they are not predicted, at most."""

@@ -11,7 +11,7 @@ from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Similarity, angle_between
 from companion.messages import LoopClosed
 from companion.slam.features.orb_features import Features
-from companion.slam.loop.loop_closure import LoopClosure, LoopDetector
+from companion.slam.loop.loop_closure import LoopClosure, LoopDetector, PlaceOf
 from companion.slam.loop.map_merge import close_loop, loop_graph, merge_maps
 from companion.slam.loop.place_recognition import KeyframeDatabase, PlaceBlock, place_blocks
 from companion.slam.loop.relocalizer import (
@@ -73,6 +73,8 @@ class Atlas:
         """Accepts or rejects a loop closure by information other than the images."""
         self.displacements_of: DisplacementSource = no_displacements
         """Displacement factors between cameras, from information other than the images."""
+        self.georeference_of: PlaceOf = lambda segment: None
+        """Place of a map in the world, by other measurements; None where it is unknown."""
         self.far_file: ArrayFile | None = None
         """Takes most of the keyframes that are left behind; without one they stay in memory."""
         self.n_loops = 0
@@ -211,15 +213,22 @@ class Atlas:
         In flight only the active map is looked for in the others, as they were then.
         """
         joined = []
-        for segment in sorted(self.segments, key=lambda each: len(each.keyframes))[:-1]:
+        waiting = sorted(self.segments, key=lambda each: len(each.keyframes))[:-1]
+        while waiting:
+            segment = waiting.pop(0)
             others = [each for each in self.segments if each is not segment]
             if len(others) == len(self.segments):
                 continue  # joined by now
             for keyframe in list(segment.keyframes.values()):
-                found = self._finder.find(keyframe, segment, others, self._plausible)
+                found = self._finder.find(
+                    keyframe, segment, others, self._plausible
+                ) or self._finder.find_placed(
+                    keyframe, segment, others, self.georeference_of, self._plausible
+                )
                 closed = found and self._close(segment, self.mapper_of(segment), found)
                 if closed:
                     joined.append(closed)
+                    waiting.append(segment)  # with what it took over it may meet another
                     break
         return joined
 

@@ -18,6 +18,7 @@ from companion.geometry.transforms import (
     rotation_from_vector,
     yaw_rotation,
 )
+from companion.messages import Georeference
 from companion.slam.loop import map_merge
 from companion.slam.loop.loop_closure import LoopClosure, LoopDetector
 from companion.slam.loop.map_merge import close_loop, loop_graph, merge_maps
@@ -278,3 +279,49 @@ def test_maps_that_met_only_while_neither_knew_are_joined_in_the_end() -> None:
     known = np.array([keyframe.centre for keyframe in whole.keyframes.values()])
     true = [*line((-14, 0), (3, 0), 18, 0.0), *line((12, 6), (2, 0.5), 12, 0.5)]
     assert known == pytest.approx(np.array([pose.translation for pose in true]), abs=0.2)
+
+
+def test_a_faint_place_is_found_again_where_satellites_say_it_is() -> None:
+    """Six of seven corners are others than before, as noise has it."""
+    rng = np.random.default_rng(10)
+    ground = Ground(rng, n=16_000)
+    old = mapped(ground, line((-14, 0), (3, 0), 18, 0.0), ELSEWHERE)
+    others = rng.random(len(ground.points)) < 6 / 7
+    ground.descriptors[others] = rng.integers(0, 256, (int(others.sum()), 32))
+    new = mapped(ground, line((3, 0.5), (-8, 0.5), 12, 0.5), NOWHERE, first_id=40)
+    assert find(45, new, [old]) is None
+    atlas = atlas_of(new, old, off_m=(0.6, -0.8, 0.2))
+    finder = LoopDetector(KeyframeDatabase(), Relocalizer(CAMERA))
+    found = finder.find_placed(
+        new.keyframes[45], new, [old], atlas.georeference_of, lambda found, same: not same
+    )
+    assert found is not None
+    assert found.here_from_there.apply(old.keyframes[3].centre) == pytest.approx(
+        line((-14, 0), (3, 0), 18, 0.0)[3].translation, abs=0.2
+    )
+    (joined,) = atlas.join_maps()
+    assert not joined.same_map
+
+
+def test_another_piece_of_a_repetitive_facade_is_not_found() -> None:
+    """Satellites place it where windows and not corners are the same."""
+    ground = Ground(np.random.default_rng(7))
+    ground.repeat(period=4.0)
+    old = mapped(ground, line((-20, 0), (-12, 0), 12, 0.0), ELSEWHERE)
+    new = mapped(ground, line((-3, 0.5), (6, 0.5), 12, 0.0), NOWHERE, first_id=40)
+    assert atlas_of(new, old, off_m=(4.0, 0.0, 0.0)).join_maps() == []
+
+
+def atlas_of(new: SlamMap, old: SlamMap, off_m: tuple[float, float, float]) -> Atlas:
+    """A flight of two maps, of which satellites place the older one wrong by that."""
+    atlas = Atlas(FeaturesConfig(), CAMERA, MapLock())
+    atlas.segments = [old, new]
+    for segment in atlas.segments:
+        for keyframe in segment.keyframes.values():
+            atlas.index_keyframe(keyframe)
+    world_from = {id(new): NOWHERE, id(old): Similarity(1.0, np.eye(3), np.array(off_m))}
+    world_from[id(old)] @= ELSEWHERE.inverse()
+    atlas.georeference_of = lambda segment: Georeference(
+        world_from[id(segment)], 0.01, 0.01, "made up", 10, 0.1
+    )
+    return atlas
