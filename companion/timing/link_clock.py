@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -231,7 +232,7 @@ class ClockFilter:
                 points.popleft()
         line = self._line_of(self._delays, now_ns, np.full(len(self._delays), STAMP_S))
         # the minimum delay is unobservable; the excess of others indicates its size
-        excess_ns = float(np.median(self._excess_ns)) if self._excess_ns else 0.0
+        excess_ns = _median(sorted(self._excess_ns)) if self._excess_ns else 0.0
         systematic_ns = math.hypot(1e9 * STAMP_S, excess_ns)
         if self._answers:
             half_ns = np.array([each.cost_ns for each in self._answers])
@@ -311,11 +312,17 @@ def _scatter(t_s: Array, value_s: Array, sigma_s: Array) -> float:
     expected = sigma_s[1:-1] ** 2 + 0.25 * (sigma_s[:-2] ** 2 + sigma_s[2:] ** 2)
     for scatter_s in SCATTERS_S:
         if (
-            1.4826 * float(np.median(second_difference / np.sqrt(expected + 1.5 * scatter_s**2)))
+            1.4826 * _median(np.sort(second_difference / np.sqrt(expected + 1.5 * scatter_s**2)))
             <= 1
         ):
             break
     return scatter_s
+
+
+def _median(ordered: Sequence[float] | Array) -> float:
+    """Median of numbers in order; numpy's own takes ten times as long for so few."""
+    n = len(ordered)
+    return float((ordered[(n - 1) // 2] + ordered[n // 2]) / 2)
 
 
 def _robust_line(t_s: Array, value_s: Array, sigma_s: Array) -> tuple[float, float, float]:
