@@ -265,7 +265,8 @@ def test_versions_before_are_read_the_same(path: Path, version: int) -> None:
     for far in (None, ArrayFile(path.parent)):
         old = read_site_map(path, far)
         assert not old.damaged and not old.places
-        for name, a, b in zip(PointArrays._fields, old.site.points, new.points, strict=True):
+        for name in PointArrays._fields:
+            a, b = getattr(old.site.points, name), getattr(new.points, name)
             every = np.arange(len(b))
             np.testing.assert_array_equal(a[every], b[every], err_msg=name)
         for one, other in zip(old.site.keyframes, new.keyframes, strict=True):
