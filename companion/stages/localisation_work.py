@@ -35,7 +35,6 @@ from companion.products.site_map_tables import SiteMapError
 from companion.runtime.stage_protocol import Finish, KeepMap, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 from companion.slam.compiled.compiling import cache_errors, shipped
-from companion.stages.later_imports import import_later
 from companion.stages.map_keeper import Kept, MapKeeper
 from companion.timing.clock import since_boot_ns
 from drivers.system.file_pages import give_back_library_pages
@@ -79,7 +78,6 @@ class _Localisation(Work):
         if setup.is_live:  # in a process of its own; of the compiler of loops nothing is needed now
             give_back_heap()
             give_back_library_pages()
-            import_later()
         self._keeper: MapKeeper | None = None
         self._to_take_up: Kept | None = None
         self._reported_fault = ""

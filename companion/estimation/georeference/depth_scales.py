@@ -9,6 +9,7 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from companion.estimation.georeference.trajectory_alignment import Scale
 from companion.geometry.transforms import Array
@@ -61,8 +62,6 @@ class DepthScales:
         mapped = np.flatnonzero(view.point_ids >= 0)
         if len(depths) < MIN_RATIOS or len(mapped) < MIN_RATIOS:
             return
-        from scipy.spatial import cKDTree  # not needed for the first pose
-
         measured = np.array([(s.u_px, s.v_px, s.depth_m, s.sigma_m) for s in depths])
         away_px, near = cKDTree(view.features.pixels[mapped]).query(measured[:, :2])
         points = slam_map.positions[view.point_ids[mapped[near]]]

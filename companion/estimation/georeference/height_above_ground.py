@@ -7,6 +7,7 @@ rangefinder measures the same distance in metres, which determines the scale of 
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from companion.geometry.transforms import Array
 
@@ -29,8 +30,6 @@ class HeightAboveGround:
 
     def __init__(self, points_map: Array, down_map: Array) -> None:
         """Take points (N, 3) and the unit vertical (3,) of the map."""
-        from scipy.spatial import cKDTree  # not needed for the first pose
-
         step = max(1, -(-len(points_map) // MOST_POINTS))
         self._points, self._down = points_map[::step], down_map
         self._plan = np.linalg.svd(down_map[None])[2][1:].T

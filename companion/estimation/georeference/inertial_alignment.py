@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from companion.estimation.georeference.tracked_places import Places
 from companion.estimation.inertial.acceleration_integral import GRAVITY_NED_M_S2, NO_GAP
@@ -169,8 +170,6 @@ class InertialAlignment:
 
         None where accelerations show none.
         """
-        from scipy.linalg import cho_solve_banded  # not needed for the first pose
-
         found, seen = self._equations(scale, sigma_map), self._seen
         weight = (scale * sigma_map) ** -2
         rights = np.stack([found.by_scale, found.right], 1)
@@ -238,8 +237,6 @@ class InertialAlignment:
         right[1:] += weighted
         squared += float((weighted * gained).sum())
         seen, by_map = self._seen, (scale * sigma_map) ** -2
-        from scipy.linalg import cholesky_banded  # not needed for the first pose
-
         band = _band(diagonal, -back) + by_map * seen.band
         factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
         determinant = 2.0 * float(np.log(factor[0]).sum())

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
 
 from companion.estimation.georeference.tracked_places import Places
 from companion.estimation.inertial.steady_level import (
@@ -137,8 +138,6 @@ def _noise(errors: Array, sound: NDArray[np.bool_]) -> _Noise | None:
 
 def _walked(angles: Array, noise: _Noise) -> Array:
     """The walk in angles (N, 3) of frames: that of gyroscopes and map together."""
-    from scipy.linalg import solveh_banded  # not needed for the first pose
-
     ratio = noise.frame / noise.walk
     band = np.zeros((2, len(angles)))
     band[0, 1:], band[1] = -ratio, 1.0

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from companion.geometry.transforms import (
     Array,
@@ -139,8 +140,6 @@ def _fit(
     scale: Scale | None,
 ) -> tuple[Similarity, Array, float, tuple[float, float]] | None:  # fmt: skip
     """The same with the scale as certain as it says; last the scale without it, and its sigma."""
-    from scipy.linalg import solve_triangular  # not needed for the first pose
-
     estimate = best_similarity(mapped, target, None if level is None else level.world_from_map)
     if not np.isfinite(estimate.scale) or estimate.scale <= 0:
         return None

@@ -21,7 +21,6 @@ import llvmlite
 import numba
 import numpy as np
 from numba import types
-from numba.core import environment
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
 from numba.core.compiler import CompileResult
 from numba.core.runtime.nrt import rtsys
@@ -107,29 +106,6 @@ def code_of_loops() -> dict[str, bytes]:
         name: pickle.dumps([done.overloads[kinds]._reduce() for kinds in done.overloads])
         for name, done in _loops.items()
     }
-
-
-_environment: Any = environment._rebuild_env
-
-
-def _environment_alone(module: str, constants: Sequence[Any], name: str) -> Any:
-    """Environment of a part of a loop, without its module where it has no constants to give.
-
-    Of numba's own parts none has; some of their modules import SciPy. A module gives what only
-    code that is not compiled would look up.
-    """
-    if constants or module in sys.modules:
-        return _environment(module, constants, name)
-    kind: Any = environment.Environment
-    made = kind._memo.get(name)
-    if made is None:
-        made = kind({"__name__": module})
-        made.env_name = name
-        kind._memo[name] = made
-    return made
-
-
-environment._rebuild_env = _environment_alone  # pickles of loops name it
 
 
 def _rebuilt(target_context: Any, parts: Sequence[Any]) -> Any:

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import Delaunay, QhullError
 
 from companion.geometry.transforms import Array
 from companion.slam.features.orb_features import Bools, Ints
@@ -50,8 +51,6 @@ def looked_through(
     Positions (P, 3) and covariances (P, 3, 3), nan where unknown, are those of the points that the
     keyframes observe; `sigma_m` is by how much keyframes and candidates may be apart besides.
     """
-    from scipy.spatial import Delaunay, QhullError  # not needed for the first pose
-
     through = np.zeros(len(candidates), np.int64)
     confirming = np.zeros(len(candidates), np.int64)
     for keyframe in keyframes:

@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from companion.geometry.transforms import Array, Similarity
 from companion.messages import Bytes
@@ -128,10 +131,6 @@ def _things(both: SiteMap, own: SiteFlight, ids: Ints, n_views: Ints) -> list[_T
     """Groups of neighbouring points."""
     if len(ids) < MIN_POINTS:
         return []
-    from scipy.sparse import coo_array  # not needed for the first pose
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     at = both.points.positions[ids]
     away = cKDTree(own.path_m).query(at)[0]
     reach = MAX_EDGE_RAD * away  # nothing is known of narrower gaps

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from companion.slam.compiled.bundle_kernels import (
@@ -129,8 +130,6 @@ def _solved(schur: Array, rhs: Array) -> Array | None:
         lower = np.linalg.cholesky(schur)
     except np.linalg.LinAlgError:
         return None
-    from scipy.linalg import solve_triangular  # not needed for the first pose
-
     half = solve_triangular(lower, rhs, lower=True, check_finite=False)
     out = solve_triangular(lower, half, lower=True, trans=1, check_finite=False)
     return np.asarray(out.reshape(-1, 6), np.float64)

@@ -10,6 +10,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import spsolve
 
 from companion.geometry.transforms import (
     Array,
@@ -108,9 +110,6 @@ def _solve(
     fixed: Collection[int],
 ) -> Array:
     """One Gauss-Newton step (n, D)."""
-    from scipy.sparse import coo_matrix  # not needed for the first pose
-    from scipy.sparse.linalg import spsolve
-
     size = of_i.shape[2]
     of_i, of_j = of_i * root_weight[:, None, None], of_j * root_weight[:, None, None]
     weighted = residual * root_weight[:, None]
