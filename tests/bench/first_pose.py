@@ -58,14 +58,19 @@ def measured() -> dict[str, float]:
     return found
 
 
+def print_steps(runs: list[dict[str, float]]) -> None:
+    """Print a row for each step of a start: its median time and the spread of all runs."""
+    for name in runs[0]:
+        values = sorted(run[name] for run in runs)
+        print(f"| {name} | {np.median(values):.2f} s | {values[0]:.2f} to {values[-1]:.2f} |")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rounds", type=int, default=3)
     with contextlib.redirect_stdout(sys.stderr):
         runs = [measured() for _ in range(parser.parse_args().rounds + 1)][1:]
-    for name in runs[0]:
-        values = sorted(run[name] for run in runs)
-        print(f"| {name} | {np.median(values):.2f} s | {values[0]:.2f} to {values[-1]:.2f} |")
+    print_steps(runs)
     return 0
 
 

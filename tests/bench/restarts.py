@@ -18,9 +18,9 @@ import threading
 import time
 from pathlib import Path
 
-import numpy as np
 import psutil
 
+from tests.bench.first_pose import print_steps
 from tests.support.flights.halting import Halting
 from tests.support.processes.flying import Flying
 
@@ -118,9 +118,7 @@ def main() -> int:
             )
             runs.append(run)
             print(f"round {n + 1}", *rows, sep="\n")
-    for step in runs[0]:
-        values = sorted(run[step] for run in runs)
-        print(f"| {step} | {np.median(values):.2f} s | {values[0]:.2f} to {values[-1]:.2f} |")
+    print_steps(runs)
     return 0
 
 
