@@ -88,12 +88,10 @@ class LoopDetector:
         """
         _, ids = here.observations_of(keyframe)
         known = {k for _, k in here.covisible(ids)} | {keyframe.keyframe_id}
-        axis = keyframe.camera_from_map.rotation[2]
         near = [
             k
-            for k in here.nearest(keyframe.centre, N_NEAR, known)
+            for k in _alike(here, keyframe.camera_from_map, N_NEAR, known)
             if abs(k - keyframe.keyframe_id) >= OTHER_PASS
-            and here.keyframes[k].camera_from_map.rotation[2] @ axis > SAME_VIEW
         ]
         for key in near[:N_CANDIDATES]:
             found = self._try(keyframe, here, here.keyframes[key], here, LOW_FOUND_RATIO)
@@ -125,14 +123,10 @@ class LoopDetector:
 
     def _in_view(self, there: SlamMap, camera_from_map: Pose) -> list[int]:
         """Keyframes nearest to a camera that look alike and show what is in its view."""
-        near = there.nearest(camera_from_map.inverse().translation, N_CANDIDATES, set())
         return [
             key
-            for key in near
-            if there.keyframes[key].camera_from_map.rotation[2] @ camera_from_map.rotation[2]
-            > SAME_VIEW
-            and self._relocalizer.n_in_view(there, there.keyframes[key], camera_from_map)
-            > MIN_FOUND
+            for key in _alike(there, camera_from_map, N_CANDIDATES, set())
+            if self._relocalizer.n_in_view(there, there.keyframes[key], camera_from_map) > MIN_FOUND
         ]
 
     def _candidates(
@@ -197,6 +191,16 @@ class LoopDetector:
             is not None
             for k in neighbours
         )
+
+
+def _alike(slam_map: SlamMap, camera_from_map: Pose, n: int, exclude: set[int]) -> list[int]:
+    """Of the `n` keyframes nearest to a camera, without those excluded, those that look alike."""
+    axis, centre = camera_from_map.rotation[2], camera_from_map.inverse().translation
+    return [
+        key
+        for key in slam_map.nearest(centre, n, exclude)
+        if slam_map.keyframes[key].camera_from_map.rotation[2] @ axis > SAME_VIEW
+    ]
 
 
 def camera_from_there(camera_from_here: Pose, here_from_there: Similarity) -> Pose:
