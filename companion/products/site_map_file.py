@@ -43,9 +43,12 @@ from companion.products.site_map_tables import (
     BLOCK,
     MAX_FEATURES,
     SCHEMA,
+    Packed,
     SiteMapError,
     SiteMapTables,
+    features_in,
     insert,
+    patches_in,
 )
 from companion.slam.loop.place_recognition import PlaceBlock, place_blocks
 from companion.slam.map.patch_store import PatchesLater, PatchRows
@@ -125,13 +128,12 @@ def read_head(path: Path) -> SiteHead:
 def read_site_map(path: Path, far: ArrayFile | None = None) -> ReadSiteMap:
     """Read a site map as far as it is whole; SiteMapError where nothing of it can be used.
 
-    With `far`, features and patches are read as they are used, and go there, as far as it takes
-    them, not into memory.
+    With `far`, packed features and patches go there, as far as it takes them, not into memory. They
+    are inflated as they are used, whatever has become of the file since.
     """
     tables = SiteMapTables(path)
     head, damaged = _head_of(tables), list[str]()
-    rows = _points(tables, head, damaged)
-    patches = _patches(tables, rows, far, damaged)
+    rows, patches = _points(tables, head, far, damaged)
     keyframes, part_of = [], []
     for n in range(head.n_keyframes):
         found = _keyframe(tables, n, head, far)
@@ -151,6 +153,7 @@ def read_site_map(path: Path, far: ArrayFile | None = None) -> ReadSiteMap:
             ids[(ids >= 0) & lost[ids]] = -1
     places = [tables.places(n) for n in range(head.n_places)]
     damaged += [f"index of places, block {n}" for n, each in enumerate(places) if each is None]
+    tables.check_unchanged()
     site = SiteMap(
         head.revision, head.parts, tuple(keyframes), np.array(part_of, np.int64),
         point_arrays(rows, patches), covariances_of(rows), head.georeference,
@@ -188,42 +191,43 @@ def _text(tables: SiteMapTables, table: str, key: int) -> bytes:
     return bytes(row[1])
 
 
-def _points(tables: SiteMapTables, head: SiteHead, damaged: list[str]) -> NDArray[np.void]:
-    rows = np.zeros(head.n_points, POINT)
+def _points(
+    tables: SiteMapTables, head: SiteHead, far: ArrayFile | None, damaged: list[str]
+) -> tuple[NDArray[np.void], PatchRows]:
+    """Points, nan where they are damaged, and their patches."""
+    rows, packed_patches = np.zeros(head.n_points, POINT), dict[int, Packed]()
     for first in range(0, head.n_points, tables.block):
         own = rows[first : first + tables.block]
         found = tables.points(first)
-        if found is None or len(found) != len(own):
+        if found is None or len(found[0]) != len(own):
             damaged.append(f"points {first} to {first + len(own) - 1}")
             own["positions"] = np.nan
         else:
-            own[:] = found
-    return rows
-
-
-def _patches(
-    tables: SiteMapTables, rows: NDArray[np.void], far: ArrayFile | None, damaged: list[str]
-) -> PatchRows:
-    """Patches of points; of all at once those of a damaged block are black."""
-
-    def read(first: int) -> Bytes:
-        grey = tables.patches(first)
-        kept = None if far is None else far.put([grey])
-        return grey if kept is None else np.asarray(kept[0])
-
+            own[:] = found[0]
+            packed_patches[first] = found[1] if far is None else _put(far, found[1])
+    version = tables.version
     if far is not None:
-        return PatchesLater(len(rows), tables.block, read)
+
+        def read(first: int) -> Bytes:
+            grey = patches_in(version, packed_patches[first])
+            kept = far.put([grey])
+            return grey if kept is None else np.asarray(kept[0])
+
+        return rows, PatchesLater(len(rows), tables.block, read)
     grey = np.zeros(len(rows), PATCH)["patch_grey"]
-    for first in range(0, len(rows), tables.block):
-        own = slice(first, first + tables.block)
-        if np.isnan(rows["positions"][first, 0]):
-            continue
+    for first, data in packed_patches.items():
+        own_grey = grey[first : first + tables.block]
         try:
-            grey[own] = read(first)
-        except (SiteMapError, ValueError):
-            damaged.append(f"patches {first} to {first + len(grey[own]) - 1}")
-            rows["positions"][own] = np.nan
-    return grey
+            own_grey[:] = patches_in(version, data)
+        except ValueError:
+            damaged.append(f"patches {first} to {first + len(own_grey) - 1}")
+            rows["positions"][first : first + tables.block] = np.nan
+    return rows, grey
+
+
+def _put(far: ArrayFile, data: bytes) -> Packed:
+    kept = far.put([np.frombuffer(data, np.uint8)])
+    return data if kept is None else memoryview(kept[0])
 
 
 def _keyframe(
@@ -233,7 +237,7 @@ def _keyframe(
     found = tables.keyframe(key)
     if found is None:
         return None
-    part, said, observed = found
+    part, said, observed, data = found
     n_features = said["n_features"]
     if not (0 < n_features <= MAX_FEATURES and 0 <= part < len(head.parts)):
         return None
@@ -243,17 +247,18 @@ def _keyframe(
         and observed["point"].max() < head.n_points
     ):
         return None
-    camera = head.parts[part].camera
+    camera, version = head.parts[part].camera, tables.version
+    lies = data if far is None else _put(far, data)
 
     def read() -> Seen:
-        rows = tables.features(key)
+        rows = features_in(version, lies)
         if len(rows) != n_features:
-            raise SiteMapError(f"{tables.path}: keyframe {key} is damaged")
+            raise ValueError("the number of features is another one")
         seen = seen_of(rows, camera, head.scale_factor)
         return seen if far is None else put_away(seen, far)
 
     try:
         seen = read() if far is None else SeenLater(read)
-    except SiteMapError:
+    except ValueError:
         return None
     return keyframe_of(key, said, observed, seen), part

@@ -143,7 +143,7 @@ def packed(rows: NDArray[np.void]) -> bytes:
     return zlib.compress(b"".join(columns), QUICKLY)
 
 
-def unpacked(data: bytes, of: np.dtype[np.void], most: int) -> NDArray[np.void]:
+def unpacked(data: bytes | memoryview, of: np.dtype[np.void], most: int) -> NDArray[np.void]:
     """Rows of their bytes, `most` at most; ValueError where they are none."""
     inflating = zlib.decompressobj()
     try:

@@ -1,7 +1,7 @@
-"""Tables of a site map's file: rows with a check each, and arrays that are read when they are used.
+"""Tables of a site map's file: rows with a check each.
 
 A row is read and checked as a whole when the map is opened. What a keyframe saw, and the patches of
-points, are inflated when they are first used.
+points, are packed bytes of it, which are inflated when they are first used.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import sqlite3
-import threading
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,6 +42,8 @@ FIRST_SPLIT = 3
 BLOCK, BLOCK_BEFORE = 128, 1024
 """Points in a row, and in one of a version before 3: the patches of a row are inflated as one."""
 DIGEST_BYTES = 16
+Packed = bytes | memoryview
+"""Bytes of rows, as they lie in a file of ours."""
 DAMAGED = (sqlite3.Error, UnicodeDecodeError)
 """A damaged page; and a message about it, in which the damaged bytes are quoted."""
 MAX_FEATURES = 20_000
@@ -83,18 +84,15 @@ def insert(file: sqlite3.Connection, table: str, *values: Any) -> None:
 
 
 class SiteMapTables:
-    """The tables of a file that nobody changes, as it is replaced as a whole."""
+    """The tables of a file that nobody changes while it is read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._lock = threading.Lock()
-        """Tracking and mapping read what they use, each in a thread of its own."""
         if not path.is_file():
             raise SiteMapError(f"{path}: there is no such file; wanted is the site.map of a run")
+        self._began = path.stat()
         try:
-            self._file = sqlite3.connect(
-                f"file:{quote(str(path.resolve()))}?immutable=1", uri=True, check_same_thread=False
-            )
+            self._file = sqlite3.connect(f"file:{quote(str(path.resolve()))}?immutable=1", uri=True)
             finalize(self, self._file.close)
             self._file.text_factory = bytes
             self._file.execute("PRAGMA cache_size = 1")  # rows are hardly ever read twice
@@ -124,12 +122,25 @@ class SiteMapTables:
                 digest.update(data)
         return str(digest.hexdigest())
 
-    def row(self, table: str, key: int, is_first: bool = True) -> tuple[Any, ...] | None:
-        """A row but for its check, None where it is damaged; the digest is of rows read first."""
+    def check_unchanged(self) -> None:
+        """SiteMapError where the file was written to since it was opened.
+
+        Another file in its place, or none, does no harm: this one is open.
+        """
         try:
-            with self._lock:
-                query = f"SELECT * FROM {table} WHERE id = ?"
-                row = self._file.execute(query, (key,)).fetchone()
+            now, then = self.path.stat(), self._began
+        except FileNotFoundError:
+            return
+        if now.st_ino == then.st_ino and (now.st_mtime_ns, now.st_size) != (
+            then.st_mtime_ns, then.st_size,
+        ):  # fmt: skip
+            raise SiteMapError(f"{self.path}: it was written to while it was read")
+
+    def row(self, table: str, key: int) -> tuple[Any, ...] | None:
+        """A row but for its check, None where it is damaged."""
+        try:
+            query = f"SELECT * FROM {table} WHERE id = ?"
+            row = self._file.execute(query, (key,)).fetchone()
         except DAMAGED:
             return None
         if row is None:
@@ -141,45 +152,33 @@ class SiteMapTables:
             found = checksum(values)
         if found != check:
             return None
-        if is_first:
-            self._digest.update(f"{table} {key} {check}\0".encode())
+        self._digest.update(f"{table} {key} {check}\0".encode())
         return tuple(values)
 
-    def keyframe(self, key: int) -> tuple[int, dict[str, Any], NDArray[np.void]] | None:
-        """Part, JSON and OBSERVED rows of a keyframe; None where it is damaged."""
+    def keyframe(self, key: int) -> tuple[int, dict[str, Any], NDArray[np.void], bytes] | None:
+        """Part, JSON, OBSERVED rows and packed features of a keyframe; None where it is damaged."""
         row = self.row("keyframe", key)
         if row is None:
             return None
         said = json.loads(row[2])
         if self._is_split:
-            return row[1], said, np.frombuffer(row[3], OBSERVED)
-        whole = self._unpacked(row[3], FEATURE, WHOLE_FEATURE, MAX_FEATURES)
-        if whole is None:
+            return row[1], said, np.frombuffer(row[3], OBSERVED), row[4]
+        try:
+            whole = features_in(self.version, row[3])
+        except ValueError:
             return None
-        return row[1], said | {"n_features": len(whole)}, observed_before(whole)
+        return row[1], said | {"n_features": len(whole)}, observed_before(whole), row[3]
 
-    def features(self, key: int) -> NDArray[np.void]:
-        """FEATURE rows of a keyframe; SiteMapError where it is damaged."""
-        row = self.row("keyframe", key, is_first=False)
-        of = FEATURE, WHOLE_FEATURE
-        rows = None if row is None else self._unpacked(row[-1], *of, MAX_FEATURES)
-        if rows is None:
-            raise SiteMapError(f"{self.path}: keyframe {key} is damaged")
-        return rows
-
-    def points(self, first: int) -> NDArray[np.void] | None:
-        """POINT rows of a block of points; None where it is damaged."""
+    def points(self, first: int) -> tuple[NDArray[np.void], bytes] | None:
+        """POINT rows of a block of points and their packed patches; None where it is damaged."""
         row = self.row("points", first)
-        rows = None if row is None else self._unpacked(row[1], POINT, WHOLE_POINT, self.block)
-        return None if rows is None else rows[list(POINT.names or ())]
-
-    def patches(self, first: int) -> Bytes:
-        """Patches of a block of points; SiteMapError where it is damaged."""
-        row = self.row("points", first, is_first=False)
-        rows = None if row is None else self._unpacked(row[-1], PATCH, WHOLE_POINT, self.block)
-        if rows is None:
-            raise SiteMapError(f"{self.path}: points from {first} on are damaged")
-        return np.asarray(rows["patch_grey"])
+        if row is None:
+            return None
+        try:
+            rows = _rows(self.version, row[1], POINT, WHOLE_POINT, self.block)
+        except ValueError:
+            return None
+        return rows[list(POINT.names or ())], row[-1]
 
     def places(self, n: int) -> PlaceBlock | None:
         """A block of the index of places; None where it is damaged."""
@@ -192,16 +191,27 @@ class SiteMapTables:
         )
         return PlaceBlock(*arrays)
 
-    def _unpacked(
-        self, data: bytes, of: np.dtype[np.void], whole: np.dtype[np.void], most: int
-    ) -> NDArray[np.void] | None:
-        """Rows of their bytes, `most` at most, which were `whole` before; None if none."""
-        of = of if self._is_split else whole
-        try:
-            rows = np.frombuffer(data, of) if self.version == 1 else unpacked(data, of, most)
-        except ValueError:
-            return None
-        return rows if len(rows) <= most else None
+
+def features_in(version: int, data: Packed) -> NDArray[np.void]:
+    """FEATURE rows of a keyframe of a version's file; ValueError where they are none."""
+    return _rows(version, data, FEATURE, WHOLE_FEATURE, MAX_FEATURES)
+
+
+def patches_in(version: int, data: Packed) -> Bytes:
+    """Patches of a block of points of a version's file; ValueError where they are none."""
+    block = BLOCK if version >= FIRST_SPLIT else BLOCK_BEFORE
+    return np.asarray(_rows(version, data, PATCH, WHOLE_POINT, block)["patch_grey"])
+
+
+def _rows(
+    version: int, data: Packed, of: np.dtype[np.void], before: np.dtype[np.void], most: int
+) -> NDArray[np.void]:
+    """Rows of their bytes, `most` at most, which were `before` in versions before 3."""
+    of = of if version >= FIRST_SPLIT else before
+    rows = np.frombuffer(data, of) if version == 1 else unpacked(data, of, most)
+    if len(rows) > most:
+        raise ValueError("there are more rows than a map of ours has")
+    return rows
 
 
 def _blake2b() -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sqlite3
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -39,11 +40,13 @@ from companion.products.site_map_tables import (
     BLOCK_BEFORE,
     VERSION,
     SiteMapError,
+    SiteMapTables,
     _digest_before,
     checksum,
 )
 from companion.slam.loop.place_recognition import place_blocks
 from companion.slam.map.map_points import PointArrays
+from companion.slam.map.seen import Seen
 from companion.slam.map.site_map import (
     SiteGeoreference,
     SiteMap,
@@ -217,11 +220,55 @@ def test_a_flight_knows_its_map_by_what_was_whole(path: Path, site: SiteMap) -> 
     assert read_site_map(path).digest != whole
 
 
-def test_what_is_damaged_while_it_is_used_ends_the_use(path: Path) -> None:
-    (keyframe, *_) = read_site_map(path, ArrayFile(path.parent)).site.keyframes
-    path.write_bytes(path.read_bytes()[:20_000])
-    with pytest.raises(SiteMapError, match="keyframe 0 is damaged"):
-        _ = keyframe.features
+def overwrite(path: Path) -> None:
+    """As cp and scp do: another map of as many keyframes and features, in the same file."""
+    other = path.with_name("other.map")
+    site = read_site_map(path).site
+    turned = (
+        replace(
+            k,
+            seen=Seen(
+                replace(k.features, descriptors=~k.features.descriptors), k.normalised, k.whitening
+            ),
+        )
+        for k in site.keyframes
+    )
+    points = site.points._replace(patch_grey=~np.asarray(site.points.patch_grey))
+    write_site_map(other, replace(site, keyframes=tuple(turned), points=points))
+    path.write_bytes(other.read_bytes())
+
+
+@pytest.mark.parametrize("change", [
+    overwrite, Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:20_000])
+])  # fmt: skip
+@pytest.mark.parametrize("has_room", [True, False])
+def test_a_map_in_use_stays_as_it_was_read(
+    path: Path, has_room: bool, change: Callable[[Path], None]
+) -> None:
+    before = read_site_map(path).site
+    used = read_site_map(path, ArrayFile(path.parent if has_room else path)).site
+    change(path)
+    for one, other in zip(before.keyframes, used.keyframes, strict=True):
+        np.testing.assert_array_equal(one.features.descriptors, other.features.descriptors)
+        np.testing.assert_array_equal(one.normalised, other.normalised)
+    every = np.arange(len(before.points.positions))
+    np.testing.assert_array_equal(before.points.patch_grey, used.points.patch_grey[every])
+
+
+def test_a_map_that_is_written_to_while_it_is_read_is_refused(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keyframe = SiteMapTables.keyframe
+
+    def meanwhile(tables: SiteMapTables, key: int) -> object:
+        found = keyframe(tables, key)
+        if key == 9:
+            path.write_bytes(path.read_bytes()[:-100])
+        return found
+
+    monkeypatch.setattr(SiteMapTables, "keyframe", meanwhile)
+    with pytest.raises(SiteMapError, match="written to while it was read"):
+        read_site_map(path)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
