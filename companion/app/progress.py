@@ -5,12 +5,6 @@ from __future__ import annotations
 import json
 from typing import Any, TextIO
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn
-from rich.progress import Progress as RichProgress
-from rich.progress import TimeRemainingColumn as RemainingColumn
-from rich.text import Text
-
 
 class Progress:
     """Receives updates between frames; this one shows nothing."""
@@ -32,16 +26,9 @@ class TerminalProgress(Progress):
     """Progress bar: frames (or `unit`) done, their rate, state, points."""
 
     def __init__(self, stream: TextIO, counted: str = "points", unit: str = "frames") -> None:
-        self._bar = RichProgress(
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn(unit),
-            _PerSecond(unit),
-            TextColumn("{task.fields[state]}"),
-            *([TextColumn("{task.fields[points]:,} " + counted)] if counted else []),
-            RemainingColumn(),
-            console=Console(file=stream),
-        )
+        from companion.app.progress_bar import progress_bar  # a tenth of a second of imports
+
+        self._bar = progress_bar(stream, counted, unit)
         self._task = self._bar.add_task(
             "", start=False, visible=False, total=None, state="", points=0
         )
@@ -79,16 +66,6 @@ class JsonProgress(Progress):
         """Write a line."""
         self._facts |= {"done": done, "state": state, "count": n_points}
         print(json.dumps(self._facts), file=self._stream, flush=True)
-
-
-class _PerSecond(ProgressColumn):
-    def __init__(self, unit: str) -> None:
-        super().__init__()
-        self._unit = unit
-
-    def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{speed:.1f} {self._unit}/s")
 
 
 def progress_on(stream: TextIO, counted: str = "points", unit: str = "frames") -> Progress:

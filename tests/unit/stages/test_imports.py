@@ -9,11 +9,12 @@ import pytest
 
 HEAVY = {
     "IPython", "PIL", "av", "jinja2", "llvmlite", "matplotlib", "mavsdk", "mcap", "numba",
-    "pandas", "pyarrow", "pymavlink", "pyopencl", "pyproj", "rerun", "rosbags", "scipy", "serial",
-    "zenoh",
+    "pandas", "pyarrow", "pymavlink", "pyopencl", "pyproj", "rerun", "rich", "rosbags", "scipy",
+    "serial", "zenoh",
 }  # fmt: skip
-"""Of 4 MB and more."""
+"""Of 4 MB, or 50 ms, and more."""
 NEEDED = {
+    "companion.app.cli": set(),
     "companion.stages.localisation_work": {"llvmlite", "numba", "scipy"},
     "companion.stages.depth_work": {"pyopencl"},
     "companion.stages.recorder_work": {"mcap", "pymavlink"},
