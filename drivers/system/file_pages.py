@@ -9,12 +9,14 @@ from pathlib import Path
 
 SMAPS = Path("/proc/self/smaps")
 MADV_DONTNEED = 4
-_MAPPING = re.compile(r"([0-9a-f]+)-([0-9a-f]+) (\S{4}) \S+ \S+ \d+ *(.*)")
-_SIZE = re.compile(r"(\w+): +(\d+) kB")
-_LIBRARY = re.compile(r"/.*\.so(\.[0-9.]+)?")
-_READ_ONLY = ("r--p", "r-xp")
-_OWN = ("Anonymous", "Swap")
-"""Pages that are no longer the file's."""
+_UNCHANGED = re.compile(
+    r"^([0-9a-f]+)-([0-9a-f]+) r-[-x]p \S+ \S+ \d+ +/.*\.so(?:\.[0-9.]+)?\n"
+    r"(?:[A-Z].*\n)*?Rss: +([1-9]\d*) kB\n"
+    r"(?:[A-Z].*\n)*?Anonymous: +0 kB\n"
+    r"(?:[A-Z].*\n)*?Swap: +0 kB$",
+    re.MULTILINE,
+)
+"""Mapping of a library that cannot be written to, with pages in memory, none of which is its own."""
 
 
 def give_back_library_pages() -> int:
@@ -40,14 +42,5 @@ def _unchanged(smaps: str) -> Iterator[tuple[int, int, int]]:
 
     None of them can be written to; one with pages of its own was, when it was relocated.
     """
-    mapping: re.Match[str] | None = None
-    kib: dict[str, int] = {}
-    for line in [*smaps.splitlines(), "0-0 ---p 0 0 0 end"]:
-        size = _SIZE.match(line)
-        if size is not None:
-            kib[size[1]] = int(size[2])
-        elif (next_mapping := _MAPPING.match(line)) is not None:
-            if mapping is not None and kib.get("Rss") and not any(kib[own] for own in _OWN):
-                yield int(mapping[1], 16), int(mapping[2], 16), kib["Rss"] << 10
-            unwritten = next_mapping[3] in _READ_ONLY and _LIBRARY.fullmatch(next_mapping[4])
-            mapping, kib = next_mapping if unwritten else None, {}
+    for mapping in _UNCHANGED.finditer(smaps):
+        yield int(mapping[1], 16), int(mapping[2], 16), int(mapping[3]) << 10
