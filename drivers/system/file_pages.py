@@ -16,7 +16,7 @@ _UNCHANGED = re.compile(
     r"(?:[A-Z].*\n)*?Swap: +0 kB$",
     re.MULTILINE,
 )
-"""Mapping of a library that cannot be written to, with pages in memory, none of which is its own."""
+"""Mapping of a library that cannot be written to, with pages in memory, all of them the file's."""
 
 
 def give_back_library_pages() -> int:

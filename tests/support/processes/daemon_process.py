@@ -30,6 +30,9 @@ from tests.support.processes.program import Run
 from tests.support.waiting import PATIENCE_S
 
 ASK_EVERY_S = 0.1
+NOT_PASSED = "JOURNAL_STREAM", "PYTHONDONTWRITEBYTECODE"
+"""Standard error is no journal; and an installed program has its bytecode: to compile it takes each
+process a second of its start."""
 PROGRAM = ("-m", "companion")
 NO_GOVERNOR = """
 import sys
@@ -76,7 +79,7 @@ class Daemon:
         self._reader = threading.Thread(target=self._read, name="journal", daemon=True)
 
     def __enter__(self) -> Daemon:
-        environment = {k: v for k, v in os.environ.items() if k != "JOURNAL_STREAM"}
+        environment = {k: v for k, v in os.environ.items() if k not in NOT_PASSED}
         self.started_ns = time.monotonic_ns()
         self._process = subprocess.Popen(
             self._command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
