@@ -88,12 +88,20 @@ class FlownFlights:
         return self._flown(self._place(name))
 
     def files(self, name: str) -> list[tuple[str, float]]:
-        """Files of a flight, and their sizes in MB; the ones most asked for first."""
+        """Files of a flight, and their sizes in MB; the ones most asked for first.
+
+        A cloud without points, as a flight without a dense map leaves it, is none of them.
+        """
         folder = self._place(name).path
+        no_points = self._results(folder)[0].get("points") == 0
+        left_out = folder / "cloud.ply" if no_points else None
         found = [
             (path.relative_to(folder).as_posix(), path.stat().st_size / MB)
             for path in sorted(folder.rglob("*"))
-            if path.is_file() and not path.is_symlink() and not path.name.startswith(".")
+            if path.is_file()
+            and not path.is_symlink()
+            and not path.name.startswith(".")
+            and path != left_out
         ]
         order = {each: n for n, each in enumerate(SHOWN)}
         found.sort(key=lambda each: (order.get(each[0], len(order)), each[0]))

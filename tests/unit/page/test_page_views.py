@@ -146,6 +146,15 @@ def test_a_flight_has_its_files_and_no_others(served: ServedPage) -> None:
         assert answer.status == 404 and b"secret" not in answer.body.replace(b"secret.txt", b"")
 
 
+def test_a_cloud_without_points_is_no_file_of_a_flight(served: ServedPage) -> None:
+    flown = served.flights / NAME
+    (flown / "cloud.ply").write_text("ply")
+    assert "cloud.ply" in here(served, f"/flights/{NAME}").text
+    (served.flights / OTHER / "cloud.ply").write_text("ply")
+    (served.flights / OTHER / "report.json").write_text(json.dumps({"points": 0}))
+    assert "cloud.ply" not in here(served, f"/flights/{OTHER}").text
+
+
 def test_a_report_runs_without_the_session(served: ServedPage) -> None:
     policy = here(served, f"/flights/{NAME}/file/report.html").headers["content-security-policy"]
     assert policy.startswith("sandbox allow-scripts;") and "allow-same-origin" not in policy
