@@ -31,8 +31,9 @@ class CameraConfig:
     rate_hz: Annotated[float, Meta(ge=1, le=240)] = 30.0
     """Frame rate requested from the camera, Hz."""
     exposure: Literal["camera", "tracking"] = "camera"
-    """v4l2: tracking chooses exposure and gain so that motion blurs by 1.5 pixels at most; camera
-    leaves them to it, but for exposure_us and gain."""
+    """v4l2, and gstreamer with libcamerasrc or nvarguscamerasrc: tracking chooses exposure and gain
+    so that motion blurs by 1.5 pixels at most; camera leaves them to it, but for exposure_us and
+    gain."""
     exposure_us: Expert[Annotated[int, Meta(ge=0, le=1000000)]] = 0
     """v4l2: exposure time, microseconds; 0 leaves it to the camera."""
     stamp_offset_ms: Expert[Annotated[float, Meta(ge=-1000, le=1000)]] = 0.0

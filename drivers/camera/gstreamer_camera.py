@@ -18,7 +18,20 @@ from pathlib import Path
 from companion.config import CameraConfig
 from companion.errors import ConfigError, SourceError
 from drivers.camera.camera_source import DriverFault, EndOfPictures, Picture
-from drivers.camera.gstreamer_child import ENDED, FAULT, GONE, HEADER, NEVER, OPENED
+from drivers.camera.exposure_choice import Exposure, ExposureRange
+from drivers.camera.gstreamer_child import (
+    ENDED,
+    FAULT,
+    GONE,
+    HEADER,
+    LIMITS,
+    NEVER,
+    OPENED,
+    PICTURE,
+    SET,
+    SETTING,
+)
+from drivers.camera.live_exposure import left_to_itself
 from drivers.camera.pixel_formats import to_grey_and_rgb
 
 CHILD = Path(__file__).with_name("gstreamer_child.py")
@@ -31,6 +44,11 @@ INSTALL = (
     "apt install python3-gi gir1.2-gstreamer-1.0 gstreamer1.0-plugins-base "
     "gstreamer1.0-plugins-good"
 )
+
+GAIN_STEPS = 64
+"""Steps of `Exposure.gain` to a gain of one."""
+FIRST = Exposure(5_000, 2 * GAIN_STEPS)
+"""Setting to begin with: what the source has set is not known. Fit for an overcast day."""
 
 Answer = tuple[bytes, int, int, int, int, bytes]
 """Kind, width, height, stride in bytes, time (ns, CLOCK_MONOTONIC), data."""
@@ -53,6 +71,9 @@ class GstreamerCamera:
         self._received = bytearray()
         self._asked = False
         self._stamped_by_us = False
+        self._chooses = config.exposure == "tracking"
+        self._exposure: Exposure | None = None
+        self._limits: ExposureRange | None = None
 
     def open(self) -> None:
         """Start the pipeline; see `CameraSource`."""
@@ -77,16 +98,55 @@ class GstreamerCamera:
             if answer is None:
                 raise SourceError(f"{self.name}: the pipeline does not start in {OPEN_S:g} s")
             self._raise_what_it_says(answer)
+            if self._chooses:
+                self._take_over_exposure(answer[5])
         except BaseException:
             self.close()
             raise
+
+    def _take_over_exposure(self, limits: bytes) -> None:
+        if not limits:
+            why = "the pipeline has no libcamerasrc or nvarguscamerasrc with an exposure to set"
+            self.remarks.append(left_to_itself(self.name, why))
+            return
+        shortest_us, longest_us, least, most = LIMITS.unpack(limits)
+        gain = round(GAIN_STEPS * least), round(GAIN_STEPS * most)
+        self._limits = ExposureRange((shortest_us, longest_us), gain)
+        self.set_exposure(
+            Exposure(
+                min(max(FIRST.exposure_us, shortest_us), longest_us),
+                min(max(FIRST.gain or 0, gain[0]), gain[1]),
+            )
+        )
+
+    @property
+    def exposure_range(self) -> tuple[ExposureRange, Exposure] | None:
+        """Limits of what can be set, and the setting; None where the camera chooses for itself.
+
+        A gain is in steps, `GAIN_STEPS` to a gain of one.
+        """
+        if self._limits is None or self._exposure is None:
+            return None
+        return self._limits, self._exposure
+
+    def set_exposure(self, wanted: Exposure) -> Exposure | None:
+        """Set exposure and gain; what was set, None where nothing can be.
+
+        The elements do not say what they have taken.
+        """
+        if self._limits is None or self._child is None:
+            return None
+        gain = (wanted.gain or GAIN_STEPS) / GAIN_STEPS
+        self._send(SET + SETTING.pack(wanted.exposure_us, gain))
+        self._exposure = wanted
+        return wanted
 
     def read(self, timeout_s: float) -> Picture | None:
         """The newest picture of the pipeline; see `CameraSource`."""
         if self._child is None:
             raise SourceError(f"{self.name}: not open")
         if not self._asked:
-            self._send(b".")
+            self._send(PICTURE)
             self._asked = True
         answer = self._receive(timeout_s)
         if answer is None:
@@ -105,6 +165,8 @@ class GstreamerCamera:
                     f"{self.name}: the pipeline stamps nothing; pictures are stamped when they come"
                 )
             t_ns = time.monotonic_ns()
+        if self._exposure is not None:  # stamped at the start of readout, as drivers of CSI do
+            t_ns -= self._exposure.exposure_us * 1_000 // 2
         return Picture(t_ns, *arrays)
 
     def close(self) -> None:
@@ -112,6 +174,7 @@ class GstreamerCamera:
         child, self._child = self._child, None
         self._received.clear()
         self._asked = False
+        self._exposure = self._limits = None
         if child is None:
             return
         assert child.stdin is not None and child.stdout is not None

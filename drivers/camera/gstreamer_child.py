@@ -3,8 +3,9 @@
 It needs nothing but the standard library and PyGObject, which a virtual environment does not have,
 and a camera's plugin that crashes or hangs takes only this process with it. Python 3.8 will do.
 
-It is sent the pipeline, then a byte for each picture that is wanted, and ends when there is nobody
-left to send. What it answers is a header, see `HEADER`, and so many bytes.
+It is sent the pipeline, then a byte for each picture that is wanted or exposure that is to be set
+(`SET`, then `SETTING`), and ends when there is nobody left to send. What it answers is a header,
+see `HEADER`, and so many bytes.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import signal
 import struct
 import sys
 import traceback
+from typing import Any
 
 HEADER = struct.Struct("<4sIIIqI")
 """Kind, width, height, bytes per row, CLOCK_MONOTONIC in ns or 0, number of bytes that follow."""
@@ -22,6 +24,18 @@ OPENED, NEVER, GONE, ENDED, FAULT = b"open", b"nevr", b"gone", b"ends", b"bugs"
 """Running; impossible, for the reason that follows; failed, likewise; no more images; a bug of this
 program, whose traceback follows."""
 CODES = {"NV12": b"NV12", "YUY2": b"YUYV", "GRAY8": b"GREY"}
+PICTURE, SET = b".", b"e"
+SETTING = struct.Struct("<If")
+"""Exposure time in microseconds, gain as a factor."""
+LIMITS = struct.Struct("<IIff")
+"""Sent with OPENED where the exposure can be set: shortest and longest exposure time in
+microseconds, least and largest gain as a factor."""
+ANY_EXPOSURE_US, ANY_GAIN = (100, 1000000), (1.0, 8.0)
+"""Taken where the source does not say: no exposure is longer than a frame anyhow, and sensors on
+CSI ports (IMX219, IMX296, IMX477, IMX708, OV9281) have an analogue gain of 10 and more."""
+LIBCAMERA = "ae-enable", "exposure-time", "analogue-gain"
+ARGUS = "exposuretimerange", "gainrange", "ispdigitalgainrange"
+"""Properties of libcamerasrc and of nvarguscamerasrc, by which each is known."""
 APPSINK = (
     " ! videoconvert ! video/x-raw,format=(string){" + ",".join(CODES) + "}"
     " ! appsink name=companion_sink drop=true max-buffers=1"
@@ -41,6 +55,51 @@ class Answers:
         left = memoryview(HEADER.pack(kind, width, height, stride, t_ns, len(data)) + data)
         while left:
             left = left[os.write(self._fd, left) :]
+
+
+class SettableSource:
+    """Source of a pipeline whose exposure can be set while it runs."""
+
+    def __init__(self, element: Any, is_argus: bool) -> None:
+        self._element = element
+        self._is_argus = is_argus
+        exposure_ns = self._range_of("exposuretimerange")
+        exposure_us = [max(1, int(each / 1000)) for each in exposure_ns] or ANY_EXPOSURE_US
+        self.limits = LIMITS.pack(*exposure_us, *(self._range_of("gainrange") or ANY_GAIN))
+        """As `LIMITS`."""
+
+    def put(self, exposure_us: int, gain: float) -> None:
+        """Set both, and put the automatic exposure off."""
+        put = self._element.set_property
+        if self._is_argus:  # a range of one value; no digital gain, which would undo it
+            put("exposuretimerange", f"{1000 * exposure_us} {1000 * exposure_us}")
+            put("gainrange", f"{gain:g} {gain:g}")
+            put("ispdigitalgainrange", "1 1")
+        else:
+            put("ae-enable", False)
+            put("exposure-time", exposure_us)
+            put("analogue-gain", gain)
+
+    def _range_of(self, name: str) -> list[float]:
+        """Range that the pipeline gives to a property of Argus; empty without."""
+        text = self._element.get_property(name) if self._is_argus else ""
+        try:
+            ends = [float(each) for each in (text or "").split()]
+        except ValueError:  # the element will say so itself
+            return []
+        return ends if len(ends) == 2 and 0 < ends[0] <= ends[1] else []
+
+
+def settable_source(Gst: Any, pipeline: Any) -> SettableSource | None:  # noqa: N803
+    """The first source of the pipeline whose exposure can be set, known by its properties."""
+    found = pipeline.iterate_recurse()
+    while True:
+        result, element = found.next()
+        if result != Gst.IteratorResult.OK:
+            return None
+        for names in (LIBCAMERA, ARGUS):
+            if all(element.find_property(name) for name in names):
+                return SettableSource(element, names == ARGUS)
 
 
 def main() -> None:
@@ -92,8 +151,15 @@ def _serve(Gst, pipeline, sink, answers) -> None:  # type: ignore[no-untyped-def
     if change == Gst.StateChangeReturn.FAILURE:
         answers.send(GONE, _fault(Gst, bus) or b"the pipeline does not start")
         return
-    answers.send(OPENED)
-    while os.read(0, 1):
+    source = settable_source(Gst, pipeline)
+    answers.send(OPENED, source.limits if source is not None else b"")
+    while True:
+        asked = os.read(0, 1)
+        if asked == SET and source is not None:
+            source.put(*SETTING.unpack(_read(SETTING.size)))
+            continue
+        if not asked:
+            return
         sample = None
         while sample is None:
             sample = sink.emit("try-pull-sample", POLL_NS)

@@ -43,10 +43,7 @@ class LiveExposure:
         self.remark = ""
         """Said once: a source of this kind cannot do as asked."""
         if asked and self._source is None:
-            self.remark = (
-                f'camera.exposure = "tracking" works with v4l2 alone: {source.name} is left to its '
-                "own exposure"
-            )
+            self.remark = left_to_itself(source.name, "only v4l2 and gstreamer cameras can be set")
         self._rate_hz = config.rate_hz
         self._choice: ExposureChoice | None = None
         self._speed = ImageSpeed()
@@ -120,6 +117,11 @@ class ImageSpeed:
         distance_m = _recent(self._range_m, t_ns) or _recent(self._height_m, t_ns)
         by_way = speed_m_s / max(distance_m, 0.1) if speed_m_s and distance_m else 0.0
         return (UNKNOWN_RAD_S if turn is None else turn) + by_way
+
+
+def left_to_itself(name: str, why: str) -> str:
+    """Remark about a camera that does not let its exposure be chosen."""
+    return f'{name}: camera.exposure = "tracking": {why}; it is left to its own exposure'
 
 
 def _recent(known: tuple[int, float] | None, t_ns: int) -> float | None:

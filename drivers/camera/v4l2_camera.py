@@ -15,6 +15,7 @@ from drivers.camera import v4l2_ioctl as v4l2
 from drivers.camera.camera_devices import find_camera, sizes_of, stable_path
 from drivers.camera.camera_source import Picture
 from drivers.camera.exposure_choice import Exposure, ExposureRange
+from drivers.camera.live_exposure import left_to_itself
 from drivers.camera.pixel_formats import CODES, to_grey_and_rgb
 from drivers.camera.v4l2_controls import ManualExposure, apply_controls
 from drivers.camera.v4l2_node import CaptureNode, FilledBuffer, PictureFormat
@@ -116,7 +117,7 @@ class V4l2Camera:
             stream.manual.give_back()
             stream.manual, stream.exposure_ns = None, 0
             if error.errno != errno.ENODEV:  # else it has gone, as the next read will say
-                self.remarks.append(_left_to_itself(self.name, f"refused: {error.strerror}"))
+                self.remarks.append(left_to_itself(self.name, f"refused: {error.strerror}"))
             return None
         stream.exposure_ns = taken.exposure_us * 1_000
         return taken
@@ -163,7 +164,7 @@ class V4l2Camera:
             stream.manual = ManualExposure(stream.node)
             stream.exposure_ns = stream.manual.now.exposure_us * 1_000
         except SourceError as error:
-            self.remarks.append(_left_to_itself(path, str(error)))
+            self.remarks.append(left_to_itself(path, str(error)))
 
     def _set_format(self, path: str, node: CaptureNode) -> PictureFormat:
         config = self._config
@@ -271,10 +272,6 @@ def _by_preference(node: CaptureNode, offered: list[str], config: CameraConfig) 
         return max(rates, default=0.0) < MAX_RATE_SHORTFALL * config.rate_hz
 
     return sorted(known, key=too_slow)
-
-
-def _left_to_itself(name: str, why: str) -> str:
-    return f'{name}: camera.exposure = "tracking": {why}; it is left to its own exposure'
 
 
 def _cannot_open(error: OSError) -> str:
