@@ -7,7 +7,7 @@ own state: the table says whether it begins again within the flight, or ends it.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,8 +62,9 @@ class InProcesses:
         }
         self.muted: set[str] = set()
         """Stages that get no messages,"""
-        self.without_frames: set[str] = set()
-        """and those that get no frames."""
+        self.frames_apart_s: Mapping[str, float] = {}
+        """and those that get a frame in so many seconds only."""
+        self._frame_ns: dict[str, int] = {}
         self.n_restarted = dict.fromkeys(self._rows, 0)
         self._lock = threading.Lock()
         self._map_lock = threading.Lock()
@@ -151,8 +152,18 @@ class InProcesses:
         for name, process in list(self.by_name.items()):
             if parcel.kind not in self._listens[name] or name in self.muted:
                 continue
-            if parcel.kind != FRAME or name not in self.without_frames:
+            if parcel.kind != FRAME or self._is_due(name, parcel.t_ns):
                 process.offer(parcel)
+
+    def _is_due(self, name: str, t_ns: int) -> bool:
+        apart_s = self.frames_apart_s.get(name)
+        if apart_s is None:
+            return True
+        before_ns = self._frame_ns.setdefault(name, t_ns)
+        if t_ns - before_ns < apart_s * 1e9:
+            return False
+        self._frame_ns[name] = t_ns
+        return True
 
     def _offer_samples(self, samples: list[Telemetry]) -> None:
         whole: Parcel | None = None

@@ -6,6 +6,7 @@ Which stages there are, and what each listens to, is in `companion.runtime.stage
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,8 +56,9 @@ from companion.runtime.stages import Stage, stage_named
 from companion.telemetry import Telemetry
 from companion.timing.clock import FlightClock, monotonic_s
 
-SHOWN = (VIEWERS, VIDEO)
-"""Stages whose pictures are left out first."""
+FRAMES_APART_S = {VIEWERS: math.inf, VIDEO: 1.0}
+"""Of stages whose pictures are left out first. A video that stands would pass for a broken one, and
+who begins to watch gets no answer before a picture comes."""
 RESTARTED = "a stage has died and is started again"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 NOT_DENSE = "the dense map cannot be begun now; switch it off and on to try again"
@@ -202,10 +204,7 @@ class LiveFlight:
 
     def set_load_levels(self, features: float, dense: float, viewer: bool) -> None:
         """Set the share of work of the stages; see companion.runtime.governor."""
-        if viewer:
-            self._processes.without_frames.difference_update(SHOWN)
-        else:
-            self._processes.without_frames.update(SHOWN)
+        self._processes.frames_apart_s = {} if viewer else FRAMES_APART_S
         self._dense_share = dense
         self._processes.order("localisation", SetLoadLevel(features))
         self._processes.order("depth", SetLoadLevel(dense))

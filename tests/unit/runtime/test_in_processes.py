@@ -445,6 +445,24 @@ def test_samples_gather_until_another_message(fly: Fly, monkeypatch: pytest.Monk
     flight.heard.until(lambda: flight.heard.texts("sample").count("71") == 2)
 
 
+def test_a_stage_may_get_a_frame_a_second_while_others_get_all(
+    fly: Fly, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight = fly(SOURCE, READER)
+    flight.until_up("source", "reader")
+    offered: dict[str, list[int]] = {"source": [], "reader": []}
+    for name, tenths in offered.items():
+        monkeypatch.setattr(
+            flight.process(name), "offer",
+            lambda parcel, tenths=tenths: tenths.append(parcel.open().seq),
+        )  # fmt: skip
+    flight.processes.frames_apart_s = {"reader": 1.0}
+    grey, rgb = np.zeros((4, 6), np.uint8), np.zeros((4, 6, 3), np.uint8)
+    for tenth in range(26):
+        flight.processes.publish(Parcel.of(Frame(tenth, tenth * 100_000_000, grey, rgb)))
+    assert offered == {"source": list(range(26)), "reader": [10, 20]}
+
+
 def test_a_flight_ends_with_its_last_samples(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gathered_samples, "HELD_S", 60.0)
     flight = fly(replace(SOURCE, listens=(*SOURCE.listens, ArmedSample)))
