@@ -1,14 +1,15 @@
 """Cost of the live daemon with everything on: processor, memory, copies, latency of the pose.
 
-    python -m tests.bench.live_cost [--seconds 60] [--rounds 1] [--against CLONE] [--seen]
+    python -m tests.bench.live_cost [--seconds 60] [--rounds 1] [--against CLONE] [--seen | --plain]
 
 The test pattern at 640x480 and 30 frames/s, dense map, recorder, exporter for viewers, an autopilot
-to which poses are sent. With --seen page and video are on too, and somebody looks at both. CLONE is
-another working tree, of an earlier version say: both are measured in turn. What is left out where
-there is too much to do is not left out here. Memory is the sum of proportional set sizes (PSS),
-without pandas, which an installed program does not have. "Pickled" is what the daemon's own process
-turns into bytes and back. The camera's thread, in the daemon, draws the pattern, and closes each
-frame for the stages.
+to which poses are sent. With --seen page and video are on too, and somebody looks at both; with
+--plain it is 320x240 and 15 frames/s, without dense map and exporter. CLONE is another working
+tree, of an earlier version say: both are measured in turn. What is left out where there is too
+much to do is not left out here. Memory is the sum of proportional set sizes (PSS), without pandas,
+which an installed program does not have. "Pickled" is what the daemon's own process turns into
+bytes and back. The camera's thread, in the daemon, draws the pattern, and closes each frame for
+the stages.
 """
 
 from __future__ import annotations
@@ -93,6 +94,8 @@ sys.exit(main())
 NO_PANDAS = "raise ModuleNotFoundError(name='pandas')"
 """A test's library wants pandas, and where it is installed Rerun's arrays import it: 45 MB."""
 SETTLE_S, UP_S = 15.0, 180.0
+WHOLE = "camera.rate_hz=30", "camera.width=640", "camera.height=480"
+PLAIN = "camera.rate_hz=15", "camera.width=320", "camera.height=240", "depth.enabled=false"
 NAMES = {"companion.streaming.export_process": "viewers"}
 
 
@@ -173,7 +176,9 @@ def own(path: Path) -> tuple[int, float]:
     return int(n), float(seconds)
 
 
-def measured(tree: Path, seconds: float, seen: bool = False) -> dict[str, float]:
+def measured(
+    tree: Path, seconds: float, seen: bool = False, plain: bool = False
+) -> dict[str, float]:
     """Figures of one run of the program in a working tree."""
     port = free_port()
     os.chdir(tree)  # from where the program is imported
@@ -184,9 +189,9 @@ def measured(tree: Path, seconds: float, seen: bool = False) -> dict[str, float]
         os.environ["PYTHONPATH"] = f"{tree}:{folder}"
         pickled = folder / "pickled"
         settings = (
-            "camera.source=pattern", "camera.rate_hz=30", "camera.width=640", "camera.height=480",
-            "daemon.flight=always", f"stream.listen=127.0.0.1:{free_port()}",
-            f"link.url=udpin:127.0.0.1:{port}", "feedback.mode=odometry",
+            "camera.source=pattern", "daemon.flight=always", f"link.url=udpin:127.0.0.1:{port}",
+            "feedback.mode=odometry",
+            *(PLAIN if plain else (*WHOLE, f"stream.listen=127.0.0.1:{free_port()}")),
         )  # fmt: skip
         page, video = free_port(), free_port()
         shown = f"page.listen=127.0.0.1:{page}", f"video.listen=127.0.0.1:{video}"
@@ -237,13 +242,17 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--against", type=Path)
-    parser.add_argument("--seen", action="store_true")
+    looked_at = parser.add_mutually_exclusive_group()
+    looked_at.add_argument("--seen", action="store_true")
+    looked_at.add_argument("--plain", action="store_true")
     arguments = parser.parse_args()
     trees = [Path(__file__).parents[2]] + ([arguments.against] if arguments.against else [])
     found: dict[Path, list[dict[str, float]]] = {tree: [] for tree in trees}
     for _ in range(arguments.rounds):
         for tree in trees:
-            found[tree].append(measured(tree.absolute(), arguments.seconds, arguments.seen))
+            found[tree].append(
+                measured(tree.absolute(), arguments.seconds, arguments.seen, arguments.plain)
+            )
     keys = sorted({key for runs in found.values() for run in runs for key in run})
     print("| |" + " | ".join(tree.absolute().name for tree in trees) + " |")
     for key in keys:
