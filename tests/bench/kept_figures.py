@@ -134,11 +134,15 @@ def verdict(
         if name == "yardstick":
             continue
         best, before = min(found), kept.get(name)
-        row = f"{name:45}{best * yard_ms:9.1f}{(max(found) / best - 1) * 100:7.0f} %"
+        spread = 100 * (max(found) / best - 1)
+        row = f"{name:45}{best * yard_ms:9.1f}{spread:7.0f} %"
         if before is not None:
             row += f"{before * yard_ms:9.1f}{best / before:8.2f}"
             if best > SLOWER * before:
-                warnings.append(f"{name}: {100 * (best / before - 1):.0f} % slower than kept")
+                slower = 100 * (best / before - 1)
+                warnings.append(
+                    f"{name}: {slower:.0f} % slower than kept; its rounds differ by {spread:.0f} %"
+                )
         lines.append(row)
     return lines, warnings
 
