@@ -8,23 +8,17 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from companion.app.progress import Progress
-from companion.calibration.board_views import (
-    Coverage,
-    IlluminatedArea,
-    View,
-    choose,
-    coverage,
-    novelty,
-)
+from companion.calibration.board_views import Coverage, choose
 from companion.calibration.calibration_verdict import advice, faults, too_few_views
-from companion.calibration.chart import Chart, parse_chart
+from companion.calibration.chart import parse_chart
+from companion.calibration.gathered_views import GatheredViews
 from companion.calibration.lens_calibration import MODELS, Calibration, calibrate_lens
 from companion.errors import InputError
 from companion.messages import Bytes
@@ -40,8 +34,6 @@ MAX_SEARCHED = 400
 MAX_VIEWS = 40
 """Views for the lens fit; more make it slower and hardly better."""
 MAX_LIVE_VIEWS = 80
-LIVE_NOVELTY, LIVE_GAIN = 0.05, 0.005
-"""Least novelty, or gain of coverage, of a view of a live camera."""
 LEAST_FITTED, LIVE_FIT_EVERY = 8, 5
 """Views of a live camera before the first lens fit, and between two fits."""
 READ_S = 0.25
@@ -50,8 +42,6 @@ SHOWN_ACROSS, SHOWN_DOWN = 16, 12
 """Cells of the coverage that is shown."""
 MIN_FOUND = 0.05
 """Least share of images with the board; below it other boards are tried."""
-N_UNFOUND_KEPT = 12
-"""Images without the board that are kept, to detect another board on them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +97,7 @@ def calibrate(
         raise InputError(f"--name {name}: wanted a name for a file, without folders")
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; --out wants a folder")
-    gathered, called = _Gathered(chart), source.name
+    gathered, called = GatheredViews(chart), source.name
     if isinstance(source, Path):
         _search(_frames(source), gathered, progress)
     else:
@@ -139,73 +129,13 @@ def print_board(board: str, path: Path) -> str:
     return paper
 
 
-@dataclass(slots=True)
-class _Gathered:
-    """Views found so far."""
-
-    chart: Chart
-    views: list[View] = field(default_factory=list)
-    lit: IlluminatedArea = field(default_factory=IlluminatedArea)
-    size: tuple[int, int] = (0, 0)
-    n_searched: int = 0
-    n_found: int = 0
-    n_blurred: int = 0
-    n_small: int = 0
-    unfound: list[Bytes] = field(default_factory=list)
-
-    def look(self, number: int, grey: Bytes, *, only_new: bool) -> str:
-        """Search an image for the board; "" when it gives a view, else the reason."""
-        height, width = grey.shape
-        if self.n_searched and self.size != (width, height):
-            raise InputError(
-                f"picture {number} is {width} x {height}, those before were {self.size[0]} x "
-                f"{self.size[1]}: a calibration is for one size"
-            )
-        self.size = width, height
-        self.n_searched += 1
-        self.lit.see(grey)
-        detection = self.chart.find(grey)
-        if detection is None:
-            self._keep_unfound(grey)
-            return "the board is not to be seen"
-        self.n_found += 1
-        view = View(number, detection, width, height)
-        if view.blurred:
-            self.n_blurred += 1
-            return "hold the board still"
-        if view.small:
-            self.n_small += 1
-            return "bring the board nearer"
-        if only_new and not self._is_new(view):
-            return "move the board"
-        self.views.append(view)
-        return ""
-
-    def covered(self) -> Coverage:
-        """Coverage of the image by the views so far."""
-        return coverage(self.views, self.lit.mask(*self.size))
-
-    def _is_new(self, view: View) -> bool:
-        if novelty(view, self.views) >= LIVE_NOVELTY:
-            return True
-        lit = self.lit.mask(*self.size)
-        before, after = coverage(self.views, lit), coverage([*self.views, view], lit)
-        return after.share >= before.share + LIVE_GAIN
-
-    def _keep_unfound(self, grey: Bytes) -> None:
-        if len(self.unfound) < N_UNFOUND_KEPT:
-            self.unfound.append(grey)
-        elif self.n_searched % 10 == 0:  # some of them from later on too
-            self.unfound[(self.n_searched // 10) % N_UNFOUND_KEPT] = grey
-
-
 def _frames(source: Path) -> FrameSource:
     if not source.exists():
         raise InputError(f"{source}: there is no such file or folder")
     return find_frames(source) if source.is_dir() else Video(source)
 
 
-def _search(frames: FrameSource, gathered: _Gathered, progress: Progress) -> None:
+def _search(frames: FrameSource, gathered: GatheredViews, progress: Progress) -> None:
     """Views of a recording."""
     progress.start(frames.n_frames)
     try:
@@ -233,7 +163,7 @@ def _sharpest(frames: FrameSource, interval: int) -> Iterator[tuple[int, Bytes, 
             best = None
 
 
-def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Progress) -> None:
+def _watch(source: CameraSource, gathered: GatheredViews, model: str, progress: Progress) -> None:
     """Views of a live camera, until there are enough or the user stops."""
     progress.start(0)
     try:
@@ -284,7 +214,7 @@ def _facts(covered: Coverage) -> dict[str, object]:
     return {"share": round(covered.share, 3), "covered": cells}
 
 
-def _judged(gathered: _Gathered, called: str, model: str) -> Calibration:
+def _judged(gathered: GatheredViews, called: str, model: str) -> Calibration:
     """The calibration, if it is fit for use."""
     refused = f"{called}: not calibrated: "
     n, found = gathered.n_searched, gathered.n_found
