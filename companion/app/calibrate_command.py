@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,11 +15,17 @@ import cv2
 import numpy as np
 
 from companion.app.progress import Progress
-from companion.calibration.board_views import Coverage, choose
+from companion.calibration.board_readout import (
+    BoardReadout,
+    TimedView,
+    fastest_moved,
+)
+from companion.calibration.board_views import Coverage, View, choose
 from companion.calibration.calibration_verdict import advice, faults, too_few_views
 from companion.calibration.chart import parse_chart
 from companion.calibration.gathered_views import GatheredViews
 from companion.calibration.lens_calibration import MODELS, Calibration, calibrate_lens
+from companion.calibration.rolling_calibration import calibrate_rolling
 from companion.errors import InputError
 from companion.messages import Bytes
 from companion.products.atomic_file import write_atomically
@@ -33,6 +39,8 @@ MAX_SEARCHED = 400
 """Images of a recording that are searched for the board, the sharpest of each interval."""
 MAX_VIEWS = 40
 """Views for the lens fit; more make it slower and hardly better."""
+MAX_MOVED = 60
+"""Images of a video about which the board is searched again to measure the readout."""
 MAX_LIVE_VIEWS = 80
 LEAST_FITTED, LIVE_FIT_EVERY = 8, 5
 """Views of a live camera before the first lens fit, and between two fits."""
@@ -50,6 +58,8 @@ class CalibrationReport:
 
     name: str
     calibration: Calibration
+    readout: BoardReadout | None
+    """None where no images with known times show the board in motion."""
     n_pictures: int
     """Images searched for the board."""
     n_found: int
@@ -76,6 +86,7 @@ class CalibrationReport:
             f"{self.n_pictures} pictures, {self.n_blurred} of them blurred; "
             f"{made.coverage.share:.0%} of the picture covered\n"
             f"  the board is flat to {made.sag_m * 1000:.1f} mm\n"
+            f"  {_shutter(self.readout)}\n"
             f"calibration: {self.toml}\n"
             f"picture: {self.picture}"
         )
@@ -98,21 +109,32 @@ def calibrate(
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; --out wants a folder")
     gathered, called = GatheredViews(chart), source.name
-    if isinstance(source, Path):
-        _search(_frames(source), gathered, progress)
-    else:
+    frames = _frames(source) if isinstance(source, Path) else None
+    if frames is not None:
+        _search(frames, gathered, progress)
+    elif not isinstance(source, Path):
         _watch(source, gathered, model, progress)
-    calibration = _judged(gathered, called, model)
+    views = _distinct_views(gathered, called)
+    if isinstance(frames, Video):
+        _see_motion(frames, views, gathered, progress)
+    calibration, readout = _judged(views, gathered, called, model)
     try:
         out.mkdir(parents=True, exist_ok=True)
         toml, picture = out / f"{name}.toml", out / f"{name}.png"
         drawn = calibration_png(calibration, name, board)
-        write_atomically(toml, calibration_toml(calibration, name, board, called))
+        write_atomically(toml, calibration_toml(calibration, readout, name, board, called))
         write_atomically(picture, drawn)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror or error}") from error
     return CalibrationReport(
-        name, calibration, gathered.n_searched, gathered.n_found, gathered.n_blurred, toml, picture
+        name,
+        calibration,
+        readout,
+        gathered.n_searched,
+        gathered.n_found,
+        gathered.n_blurred,
+        toml,
+        picture,
     )
 
 
@@ -149,6 +171,42 @@ def _search(frames: FrameSource, gathered: GatheredViews, progress: Progress) ->
         raise InputError(f"{frames.path}: none of its {frames.n_frames} pictures can be decoded")
 
 
+def _see_motion(
+    video: Video, views: Sequence[View], gathered: GatheredViews, progress: Progress
+) -> None:
+    """Timed views with those just before and after them: of the lens fit, and of quick motion."""
+    numbers = [view.number for view in views] + fastest_moved(gathered.middles_px, MAX_MOVED)
+    wanted = sorted({number + k for number in numbers for k in (-1, 0, 1)} - {-1})
+    if not wanted:
+        return
+    times_ns = video.own_times_ns()
+    progress.start(len(wanted))
+    try:
+        for number, rgb in video.pictures(wanted[0], min(wanted[-1], video.n_frames - 1)):
+            if rgb is None or number not in wanted:
+                continue
+            grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+            detection = gathered.chart.find(grey)
+            if detection is not None:
+                view = View(number, detection, *gathered.size)
+                gathered.timed.append(TimedView(times_ns[number], view))
+            progress.update(wanted.index(number) + 1, "measuring the readout", len(gathered.timed))
+    finally:
+        progress.finish()
+
+
+def _shutter(readout: BoardReadout | None) -> str:
+    if readout is None:
+        return "readout not measured: for a rolling shutter, film the board in quick motion, too"
+    measured = f"{readout.measured_ms:.2f} ± {readout.sigma_ms:.2f} ms"
+    if readout.is_upward:
+        return f"readout {measured}: the bottom row is read first, which cannot be undone"
+    if readout.readout_ms is None:
+        return f"readout {measured}, too uncertain to be used: film the board in quick motion, too"
+    shutter = "rolling" if readout.readout_ms else "global"
+    return f"{shutter} shutter: {measured} from the top row to the bottom row"
+
+
 def _sharpest(frames: FrameSource, interval: int) -> Iterator[tuple[int, Bytes, int]]:
     """Number and grey image of the sharpest of each interval, and how many are decoded so far."""
     best: tuple[float, int, Bytes] | None = None
@@ -175,7 +233,7 @@ def _watch(source: CameraSource, gathered: GatheredViews, model: str, progress: 
             if picture is None:
                 progress.update(number, "no picture comes", len(gathered.views))
                 continue
-            problem = gathered.look(number, picture.grey, only_new=True)
+            problem = gathered.look(number, picture.grey, only_new=True, t_ns=picture.monotonic_ns)
             number += 1
             covered = gathered.covered()
             wanted = advice(gathered.views, covered, made)
@@ -214,8 +272,8 @@ def _facts(covered: Coverage) -> dict[str, object]:
     return {"share": round(covered.share, 3), "covered": cells}
 
 
-def _judged(gathered: GatheredViews, called: str, model: str) -> Calibration:
-    """The calibration, if it is fit for use."""
+def _distinct_views(gathered: GatheredViews, called: str) -> list[View]:
+    """Views for the lens fit; InputError where the board was not seen well."""
     refused = f"{called}: not calibrated: "
     n, found = gathered.n_searched, gathered.n_found
     if found < MIN_FOUND * n:  # perhaps by chance, on a board that is another one
@@ -236,8 +294,19 @@ def _judged(gathered: GatheredViews, called: str, model: str) -> Calibration:
             f"{refused}the board is too small in {gathered.n_small} of the {found} pictures that "
             "show it: bring it nearer"
         )
+    return views
+
+
+def _judged(
+    views: Sequence[View], gathered: GatheredViews, called: str, model: str
+) -> tuple[Calibration, BoardReadout | None]:
+    """The calibration, if it is fit for use, and the readout, if it could be measured."""
     lit = gathered.lit.mask(*gathered.size)
     calibration = calibrate_lens(views, lit, model)
+    readout: BoardReadout | None = None
+    if calibration is not None:
+        timed = list(gathered.timed)
+        calibration, readout = calibrate_rolling(views, timed, lit, model, calibration)
     if calibration is None:
         reasons = too_few_views(len(views)) or [
             f"no lens explains the {len(views)} views: is the board flat, and the one given?"
@@ -245,5 +314,5 @@ def _judged(gathered: GatheredViews, called: str, model: str) -> Calibration:
     else:
         reasons = faults(calibration)
     if reasons or calibration is None:
-        raise InputError(refused + "; ".join(reasons))
-    return calibration
+        raise InputError(f"{called}: not calibrated: " + "; ".join(reasons))
+    return calibration, readout

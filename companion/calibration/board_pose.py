@@ -50,7 +50,7 @@ def board_pose(view: View, model: LensModel, parameters: Array) -> Array | None:
     for before, pose in found:
         if best is not None and before > MAX_AMBIGUITY_RATIO * found[0][0]:
             break
-        refined = _refine_pose(view, model, parameters, pose)
+        refined = refined_pose(view, model, parameters, pose)
         cost = _pose_cost(view, model, parameters, refined)
         if math.isfinite(cost) and (best is None or cost < best[0]):
             best = cost, refined
@@ -70,7 +70,8 @@ def _pose_cost(view: View, model: LensModel, parameters: Array, pose: Array) -> 
     return float((reprojection_residual(view, model, parameters, pose) ** 2).sum())
 
 
-def _refine_pose(view: View, model: LensModel, parameters: Array, pose: Array) -> Array:
+def refined_pose(view: View, model: LensModel, parameters: Array, pose: Array) -> Array:
+    """Board pose of least squares near another (6,), for a known lens."""
     damping = 1e-3
     for _ in range(20):
         pixels, _, by = project_corners(view, model, parameters, pose)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 
+from companion.calibration.board_readout import TimedView
 from companion.calibration.board_views import (
     Coverage,
     IlluminatedArea,
@@ -13,12 +15,15 @@ from companion.calibration.board_views import (
 )
 from companion.calibration.chart import Chart
 from companion.errors import InputError
+from companion.geometry.transforms import Array
 from companion.messages import Bytes
 
 LIVE_NOVELTY, LIVE_GAIN = 0.05, 0.005
 """Least novelty, or gain of coverage, of a view of a live camera."""
 N_UNFOUND_KEPT = 12
 """Images without the board that are kept, to detect another board on them."""
+N_TIMED = 3000
+"""Newest views of a live camera that are kept to measure its readout: some minutes, 3 MB."""
 
 
 @dataclass(slots=True)
@@ -34,8 +39,12 @@ class GatheredViews:
     n_blurred: int = 0
     n_small: int = 0
     unfound: list[Bytes] = field(default_factory=list)
+    middles_px: list[tuple[int, Array]] = field(default_factory=list)
+    """Number of each image with the board, and the board's middle in it."""
+    timed: deque[TimedView] = field(default_factory=lambda: deque(maxlen=N_TIMED))
+    """Views of a camera that stamps its images, also where they are no good for the lens."""
 
-    def look(self, number: int, grey: Bytes, *, only_new: bool) -> str:
+    def look(self, number: int, grey: Bytes, *, only_new: bool, t_ns: int | None = None) -> str:
         """Search an image for the board; "" when it gives a view, else the reason."""
         height, width = grey.shape
         if self.n_searched and self.size != (width, height):
@@ -52,6 +61,9 @@ class GatheredViews:
             return "the board is not to be seen"
         self.n_found += 1
         view = View(number, detection, width, height)
+        self.middles_px.append((number, detection.image_px.mean(0)))
+        if t_ns is not None:
+            self.timed.append(TimedView(t_ns, view))
         if view.blurred:
             self.n_blurred += 1
             return "hold the board still"

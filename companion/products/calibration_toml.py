@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from companion.calibration.board_readout import BoardReadout
 from companion.calibration.lens_calibration import Calibration
 from companion.config_file import toml_value
 from companion.geometry.camera import COEFFICIENTS
 
 
-def calibration_toml(calibration: Calibration, name: str, board: str, source: str) -> bytes:
-    """The file: lens parameters, and its quality under [quality]."""
+def calibration_toml(
+    calibration: Calibration, readout: BoardReadout | None, name: str, board: str, source: str
+) -> bytes:
+    """The file: lens parameters, readout where it is known, and quality under [quality]."""
     camera = calibration.camera
     lens: dict[str, object] = {
         "name": name,
@@ -22,6 +25,8 @@ def calibration_toml(calibration: Calibration, name: str, board: str, source: st
     keys = COEFFICIENTS[camera.distortion]
     for key, value in zip(keys, camera.coefficients, strict=True):
         lens[key] = round(value, 8)
+    if readout is not None and readout.readout_ms is not None:
+        lens["readout_ms"] = round(readout.readout_ms, 2)
     sigmas = zip(("fx", "fy", "cx", "cy"), calibration.sigmas[:4], strict=True)
     quality: dict[str, object] = {
         "rms_px": round(calibration.rms_px, 4),
@@ -32,6 +37,7 @@ def calibration_toml(calibration: Calibration, name: str, board: str, source: st
         "n_corners_rejected": calibration.n_corners_rejected,
         "coverage": round(calibration.coverage.share, 3),
         **{f"sigma_{key}": round(float(sigma), 4) for key, sigma in sigmas},
+        **({} if readout is None else {"sigma_readout_ms": round(readout.sigma_ms, 3)}),
         "board_sag_mm": round(calibration.sag_m * 1000, 2),
         "board": board,
         "source": source,
