@@ -81,8 +81,8 @@ def add_parsers(commands: Any) -> None:
     add_path(merged, "--out", "FILE", NEW_MAP, required=True)
     pruned = whats.add_parser("prune", parents=[given], help="leave out redundant keyframes")
     pruned.add_argument(
-        "--within", type=amount, default=3.0, metavar="DEG",
-        help="largest angle, seen from its points, to a keyframe that stays (default: 3 degrees)",
+        "--within", type=amount, default=10.0, metavar="DEG",
+        help="largest angle, seen from its points, to its neighbour (default: 10 degrees)",
     )  # fmt: skip
     add_path(pruned, "--out", "FILE", NEW_MAP, required=True)
     saved = whats.add_parser("save", parents=[given], help="copy the map of a run")

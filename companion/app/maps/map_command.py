@@ -105,11 +105,15 @@ def save(path: Path, out: Path) -> ReadSiteMap:
 
 def prune(path: Path, out: Path, spacing_deg: float) -> str:
     """Write a map without redundant keyframes; a line about what is left."""
-    site = read_site_map(map_path(path)).site
+    path = map_path(path)
+    site, whole_mb = read_site_map(path).site, path.stat().st_size / BYTES_PER_MB
     pruned = prune_site(site, spacing_deg)
     write_site_map(out, pruned)
-    size_mb = out.stat().st_size / BYTES_PER_MB
-    return f"{len(pruned.keyframes)} of {len(site.keyframes)} keyframes left, {size_mb:.1f} MB"
+    return (
+        f"{len(pruned.keyframes)} of {len(site.keyframes)} keyframes and "
+        f"{len(pruned.points.positions)} of {len(site.points.positions)} points left, "
+        f"{out.stat().st_size / BYTES_PER_MB:.1f} of {whole_mb:.1f} MB"
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
 """Culling of redundant keyframes, so that hovering and return passes do not grow the map.
 
-A keyframe is culled if another is closer than the keyframe spacing and three others observe nearly
-all of its points at the same or a finer scale (after Mur-Artal & Tardos, T-RO 2015). Frames and
-cloud chunks that refer to it follow its anchor, the nearest keyframe.
+A keyframe is culled if another is closer than the keyframe spacing and three others, or so many as
+are given, observe nearly all of its points at the same or a finer scale (after Mur-Artal & Tardos,
+T-RO 2015). Frames and cloud chunks that refer to it follow its anchor, the nearest keyframe.
 """
 
 from __future__ import annotations
@@ -22,10 +22,13 @@ N_NEWEST_KEPT, N_OLDEST_KEPT = 4, 5
 MIN_SHARED = 30
 
 
-def cull_keyframes(slam_map: SlamMap, newest: Keyframe, spacing_deg: float) -> list[int]:
+def cull_keyframes(
+    slam_map: SlamMap, newest: Keyframe, spacing_deg: float, n_observers: int = MIN_OBSERVERS
+) -> list[int]:
     """Cull redundant keyframes around the newest one, newer ones first; returns their ids.
 
-    A keyframe is a candidate within `spacing_deg` of another, as an angle seen from its points.
+    A keyframe is a candidate within `spacing_deg` of another, as an angle seen from its points, and
+    redundant where `n_observers` others observe these.
     """
     spacing = float(np.tan(np.radians(spacing_deg)))
     keys = list(slam_map.keyframes)
@@ -38,7 +41,7 @@ def cull_keyframes(slam_map: SlamMap, newest: Keyframe, spacing_deg: float) -> l
     for key in sorted(near, reverse=True):
         keyframe = slam_map.keyframes[key]
         anchor = _nearest(slam_map, keyframe, spacing)
-        if anchor is not None and _redundant(slam_map, keyframe):
+        if anchor is not None and _redundant(slam_map, keyframe, n_observers):
             retire(slam_map, keyframe, anchor)
             culled.append(key)
     return culled
@@ -59,7 +62,7 @@ def _nearest(slam_map: SlamMap, keyframe: Keyframe, spacing: float) -> Keyframe 
     return other if np.count_nonzero(shared) >= 0.5 * len(points) else None
 
 
-def _redundant(slam_map: SlamMap, keyframe: Keyframe) -> bool:
+def _redundant(slam_map: SlamMap, keyframe: Keyframe, n_observers: int) -> bool:
     features, points = slam_map.observations_of(keyframe)
     octave = np.full(slam_map.n_points + 1, -1, np.int64)
     octave[points] = keyframe.features.octaves[features]
@@ -71,9 +74,8 @@ def _redundant(slam_map: SlamMap, keyframe: Keyframe) -> bool:
         theirs, ids = slam_map.observations_of(other)
         as_fine = other.features.octaves[theirs] <= octave[ids] + MAX_COARSER_LEVELS
         others[ids[as_fine & (octave[ids] >= 0)]] += 1
-    return int(np.count_nonzero(others[points] >= MIN_OBSERVERS)) >= MIN_REDUNDANT_RATIO * len(
-        points
-    )
+    seen_often = int(np.count_nonzero(others[points] >= n_observers))
+    return seen_often >= MIN_REDUNDANT_RATIO * len(points)
 
 
 def retire(slam_map: SlamMap, keyframe: Keyframe, anchor: Keyframe) -> None:

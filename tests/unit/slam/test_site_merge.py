@@ -163,6 +163,21 @@ def test_pruning_leaves_out_redundant_keyframes_only(tmp_path: Path) -> None:
     assert {k.t_ns for k in pruned.keyframes} < times
 
 
+def test_pruning_thins_a_flight_that_sees_its_ground_often(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Keyframes 6 degrees apart, each point in a dozen of them."""
+    path = [flown(np.array([1.0 * n, 0.0])) for n in range(-10, 11)]
+    site = kept(Ground(np.random.default_rng(8)), path, "line", 0.0, 1.0)
+    write_site_map(tmp_path / "all.map", site)
+    out = tmp_path / "few.map"
+    assert main(["map", "prune", str(tmp_path / "all.map"), "--out", str(out)]) == 0
+    pruned = read_site_map(out).site
+    assert len(pruned.keyframes) <= 0.7 * len(site.keyframes)
+    assert len(pruned.points.positions) >= 0.9 * len(site.points.positions)
+    assert f"{len(pruned.keyframes)} of 21 keyframes" in capsys.readouterr().out
+
+
 def test_the_command_merges_files(
     sites: tuple[SiteMap, SiteMap], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
