@@ -178,7 +178,7 @@ class SiteMapTables:
             rows = _rows(self.version, row[1], POINT, WHOLE_POINT, self.block)
         except ValueError:
             return None
-        return rows[list(POINT.names or ())], row[-1]
+        return rows if self._is_split else rows[list(POINT.names or ())], row[-1]
 
     def places(self, n: int) -> PlaceBlock | None:
         """A block of the index of places; None where it is damaged."""
