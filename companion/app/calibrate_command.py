@@ -40,7 +40,7 @@ MAX_SEARCHED = 400
 MAX_VIEWS = 40
 """Views for the lens fit; more make it slower and hardly better."""
 MAX_MOVED = 60
-"""Images of a video about which the board is searched again to measure the readout."""
+"""Images about which the readout is measured, besides those of the lens fit."""
 MAX_LIVE_VIEWS = 80
 LEAST_FITTED, LIVE_FIT_EVERY = 8, 5
 """Views of a live camera before the first lens fit, and between two fits."""
@@ -174,9 +174,8 @@ def _search(frames: FrameSource, gathered: GatheredViews, progress: Progress) ->
 def _see_motion(
     video: Video, views: Sequence[View], gathered: GatheredViews, progress: Progress
 ) -> None:
-    """Timed views with those just before and after them: of the lens fit, and of quick motion."""
-    numbers = [view.number for view in views] + fastest_moved(gathered.middles_px, MAX_MOVED)
-    wanted = sorted({number + k for number in numbers for k in (-1, 0, 1)} - {-1})
+    """Gather timed views, which a video's first search has left out in between."""
+    wanted = sorted(_timed_numbers(views, gathered))
     if not wanted:
         return
     times_ns = video.own_times_ns()
@@ -193,6 +192,12 @@ def _see_motion(
             progress.update(wanted.index(number) + 1, "measuring the readout", len(gathered.timed))
     finally:
         progress.finish()
+
+
+def _timed_numbers(views: Sequence[View], gathered: GatheredViews) -> set[int]:
+    """Images that measure the readout: of the lens fit, of quick motion, and those beside them."""
+    numbers = [view.number for view in views] + fastest_moved(gathered.middles_px, MAX_MOVED)
+    return {number + k for number in numbers for k in (-1, 0, 1) if number + k >= 0}
 
 
 def _shutter(readout: BoardReadout | None) -> str:
@@ -305,7 +310,8 @@ def _judged(
     calibration = calibrate_lens(views, lit, model)
     readout: BoardReadout | None = None
     if calibration is not None:
-        timed = list(gathered.timed)
+        numbers = _timed_numbers(views, gathered)
+        timed = [each for each in gathered.timed if each.view.number in numbers]
         calibration, readout = calibrate_rolling(views, timed, lit, model, calibration)
     if calibration is None:
         reasons = too_few_views(len(views)) or [
