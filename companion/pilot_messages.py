@@ -106,6 +106,11 @@ SOURCE_NOT = PilotMessage(WARNING, "EKF sources not switched, see its log")
 MARKER_SEEN = PilotMessage(INFO, "landing marker in sight")
 MARKER_LOST = PilotMessage(NOTICE, "landing marker lost")
 
+# -- obstacles -----------------------------------------------------------------
+
+OBSTACLES_KNOWN = PilotMessage(INFO, "obstacles in view are reported")
+OBSTACLES_UNKNOWN = PilotMessage(WARNING, "obstacles unknown: none is reported")
+
 # -- camera and autopilot -----------------------------------------------------------------
 
 CAMERA_NOT_FOUND = PilotMessage(WARNING, "camera not found")

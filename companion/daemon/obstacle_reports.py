@@ -20,7 +20,8 @@ from companion.messages import DepthMap, Frame, MapUpdate, ObstaclesSeen, PointC
 from companion.obstacles.depth_points import obstacle_points
 from companion.obstacles.obstacle_edges import nothing_seen, seen_around
 from companion.obstacles.obstacle_finder import ObstacleFinder, Round
-from companion.obstacles.obstacle_sectors import FREE_M, MAX_M, Obstacles
+from companion.obstacles.obstacle_sectors import FREE_M, MAX_M, UNKNOWN_CM, Obstacles
+from companion.pilot_messages import OBSTACLES_KNOWN, OBSTACLES_UNKNOWN
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.measurements.obstacle_distance import obstacle_messages
@@ -64,12 +65,13 @@ class ObstacleReports:
         self._finder: ObstacleFinder | None = None
         self._known_ns: int | None = None
         self._n_parts = 0
-        self._is_shown = False
+        self._is_shown = self._is_told = False
+        self._seen_ns: int | None = None
 
     def restart(self, camera: Camera | None) -> None:
         """Begin another flight with another map."""
         self._finder = None if camera is None else ObstacleFinder(camera)
-        self._known_ns, self._n_parts, self._is_shown = None, 0, False
+        self._known_ns, self._n_parts, self._is_shown, self._seen_ns = None, 0, False, None
 
     def take(self, message: Track | MapUpdate | DepthMap | PointChunk) -> None:
         """Take a track, a map update, a depth map or points."""
@@ -110,6 +112,7 @@ class ObstacleReports:
         if found is not None:
             self._known_ns = look.t_ns
         self._show(look, found)
+        self._tell_pilot(look.t_ns, found)
         known_ns = look.t_ns if self._known_ns is None else self._known_ns
         sent = look.t_ns - known_ns <= UNKNOWN_AFTER_NS
         if look.given is not None:
@@ -125,6 +128,19 @@ class ObstacleReports:
         for message in messages:
             self._link.send(message)
         return messages
+
+    def _tell_pilot(self, t_ns: int, found: Obstacles | Array | None) -> None:
+        """Say when nothing has been known for a while, and when something is: in any sector.
+
+        ArduPilot flies into the unknown as if nothing stood there, and says nothing.
+        """
+        unknown = isinstance(found, Obstacles) and not (found.distances_cm != UNKNOWN_CM).any()
+        if found is not None and not unknown:
+            self._seen_ns = t_ns
+        is_known = self._seen_ns is not None and t_ns - self._seen_ns <= UNKNOWN_AFTER_NS
+        if is_known != self._is_told:
+            if self._link.say(OBSTACLES_KNOWN() if is_known else OBSTACLES_UNKNOWN()):
+                self._is_told = is_known
 
     def _show(self, look: Look, found: Obstacles | Array | None) -> None:
         """Pass on what is drawn; nothing, once, when nothing is known any more."""

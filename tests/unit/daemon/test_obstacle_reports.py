@@ -34,6 +34,7 @@ from companion.messages import (
 from companion.obstacles.obstacle_finder import MAX_AGE_NS, MOST_TRACKS
 from companion.obstacles.obstacle_sectors import FREE_M
 from companion.obstacles.occupancy_grid import DOUBT, FADES_NS, MOST
+from companion.pilot_messages import PilotText
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.vehicle import Firmware, Vehicle
@@ -354,6 +355,28 @@ def test_before_anything_is_known_all_is_unknown() -> None:
     approach = Approach()
     assert set(approach.now()) == {UNKNOWN}
     assert set(approach.fly(1e-9 * UNKNOWN_AFTER_NS + 1.0, 0.0, tracked=False)) == {UNKNOWN}
+
+
+def test_the_pilot_is_told_when_obstacles_are_known_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    approach, said = Approach(), list[str]()
+
+    def say(text: PilotText) -> bool:
+        said.append(text.text)
+        return True
+
+    monkeypatch.setattr(approach.link, "say", say)
+    approach.now()
+    assert said == []  # nothing is lost that never was there
+    approach.fly(2.0)
+    assert said == ["Companion: obstacles in view are reported"]
+    approach.fly(1e-9 * UNKNOWN_AFTER_NS - 0.1, tracked=False)
+    assert len(said) == 1
+    approach.fly(1e-9 * MAX_AGE_NS + 0.2, tracked=False)
+    assert said[1:] == ["Companion: obstacles unknown: none is reported"]
+    approach.fly(0.5)
+    assert said[2:] == ["Companion: obstacles in view are reported"]
 
 
 @pytest.mark.parametrize("radius_m", [0.05, 0.1])
