@@ -11,8 +11,8 @@ import numpy as np
 from companion.geometry.transforms import Array
 from tests.firmware import manoeuvres
 from tests.firmware.figures import Figures, percentile, strayed_m
-from tests.firmware.landmarks import FAMILY_WORD, MARKER_ID, MARKER_M
-from tests.firmware.pilots import SET_EKF_SOURCE_SET, CopterPilot
+from tests.firmware.landmarks import FAMILY_WORD, MARKER_ID, MARKER_M, landmarks_of
+from tests.firmware.pilots import SET_EKF_SOURCE_SET, CopterPilot, Px4Pilot
 from tests.firmware.trial import Conditions, Trial
 
 GPS_S, PLACED_S = 90.0, 30.0
@@ -22,9 +22,8 @@ SAID_S, JUMP_M = 3.0, 0.3
 MARKER_AT = 1.5, 1.0
 MARKER_OFF_M = 0.15
 WALL_NORTH_M, CLEAR_M = 16.0, 1.5
-FORWARD = 0.25
-"""Of the pitch stick: 3 m/s by ArduCopter's LOIT_SPEED of 12.5 m/s."""
-WALL_S, STOPPED_M_S = 25.0, 0.1
+WALL_S, STOPPED_M_S, HIGHER_S = 25.0, 0.1, 2.0
+BEHIND_M, AROUND_S = 6.0, 60.0
 BEFORE_A_WALL = Conditions(
     wind_m_s=0.0, pitch_deg=-20.0, landmarks=f"wall:{WALL_NORTH_M:g}", has_depth=True,
     parameters={"PRX1_TYPE": 2, "PRX_FILT": 0, "AVOID_ENABLE": 7},
@@ -145,22 +144,50 @@ def wall(trial: Trial, figures: Figures) -> None:
     if not manoeuvres.up(trial, figures):
         return
     trial.pilot.stream(None)
-    trial.mark(f"LOITER: {trial.pilot.set_mode('LOITER')}")
+    trial.mark(f"holds: {trial.pilot.set_mode(trial.pilot.holds_in)}")
     time.sleep(manoeuvres.SETTLE_S)
+    if isinstance(trial.pilot, Px4Pilot):  # it does not fly into the unknown, and a hover sees none
+        trial.mark("a little higher")
+        trial.ground.sticks = lambda: Px4Pilot.higher
+        time.sleep(HIGHER_S)
     trial.mark("stick forward")
     began_s = time.time()
-    trial.ground.sticks = lambda: (0.0, -FORWARD, 0.5, 0.0)
+    trial.ground.sticks = lambda: trial.pilot.forward
     trial.until("at rest", lambda: _at_rest(trial, began_s + 6.0), WALL_S)
     trial.pilot.hold_sticks(in_air=True)
-    path = trial.ground.window(began_s, time.time())
-    clear_m = WALL_NORTH_M - float(path[:, 0].max())
-    nearest = trial.ground.latest.get("COMPANION/OBSTACLE_DISTANCE")
-    told = f", which it is told to be {min(nearest.distances) / 100:.2f} m off" if nearest else ""
-    trial.mark(f"stopped {clear_m:.2f} m before the wall{told}")
-    figures.add("flown towards the wall", float(path[-1, 0] - path[0, 0]), "m")
-    figures.add("nearer to the wall than 1.5 m by", max(0.0, CLEAR_M - clear_m), "m", 0.0,
-                f"{clear_m:.2f} m clear")  # fmt: skip
+    _add_clearance(trial, figures, began_s)
     trial.pilot.land()
+
+
+def wall_around(trial: Trial, figures: Figures) -> None:
+    """Told a place behind a wall: the autopilot's own planner finds a way round, or none."""
+    if not manoeuvres.up(trial, figures):
+        return
+    manoeuvres.ready_to_go(trial)
+    began_s, here = time.time(), trial.ground.believed_m
+    behind = here + np.array([WALL_NORTH_M + BEHIND_M, 0.0, 0.0])
+    trial.pilot.send_to(behind)
+
+    def is_there() -> bool:
+        return bool(np.linalg.norm((trial.ground.believed_m - behind)[:2]) < 1.0)
+
+    trial.until("behind the wall", is_there, AROUND_S)
+    _add_clearance(trial, figures, began_s)
+    figures.add_true("came behind the wall", is_there())
+    trial.pilot.land()
+
+
+def _add_clearance(trial: Trial, figures: Figures, began_s: float) -> None:
+    """Figures of how near the wall was since then."""
+    path = trial.ground.window(began_s, time.time())
+    (box,) = landmarks_of(trial.conditions.landmarks).walls()
+    off = np.abs(path[:, :2] - [box.north, box.east]) - [box.half_north, box.half_east]
+    clear_m = float(np.linalg.norm(np.maximum(off, 0.0), axis=1).min())
+    nearest = trial.ground.latest.get("COMPANION/OBSTACLE_DISTANCE")
+    told = f", told now {min(nearest.distances) / 100:.2f} m" if nearest else ""
+    figures.add("flown towards the wall", float(path[:, 0].max() - path[0, 0]), "m")
+    figures.add("nearer to the wall than 1.5 m by", max(0.0, CLEAR_M - clear_m), "m", 0.0,
+                f"{clear_m:.2f} m clear{told}")  # fmt: skip
 
 
 def _when_told(trial: Trial, since_s: float, *texts: str) -> float | None:
@@ -209,6 +236,13 @@ FEATURES: dict[str, tuple[Callable[[Trial, Figures], None], Conditions]] = {
         settings=("feedback.global_position=sensor",),
     )),
     "wall": (wall, BEFORE_A_WALL),
+    "wall_px4": (wall, replace(BEFORE_A_WALL, parameters={
+        "CP_DIST": 2.4, "MPC_VEL_MANUAL": 5,  # 1.5 m, and what docs/autopilots.md adds
+    })),
+    "wall_around": (wall_around, replace(BEFORE_A_WALL, parameters={
+        "PRX1_TYPE": 2, "PRX_FILT": 0, "AVOID_ENABLE": 0, "OA_TYPE": 1, "OA_BR_LOOKAHEAD": 8,
+        "OA_MARGIN_MAX": 2.4, "WPNAV_SPEED": 250, "GUID_OPTIONS": 64,
+    })),
     "wall_3d": (wall, replace(
         BEFORE_A_WALL, settings=(*BEFORE_A_WALL.settings, "feedback.obstacles_3d=true")
     )),

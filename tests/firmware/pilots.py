@@ -17,7 +17,7 @@ from companion.geometry.transforms import Array
 from tests.firmware.ground import CENTRED, THROTTLE_LOW, Ground
 from tests.firmware.simulators import Px4, Simulator
 
-PLACE_AND_YAW, PLACE_SPEED_AND_YAW = 0b100111111000, 0b100111000000
+PLACE, PLACE_AND_YAW, PLACE_SPEED_AND_YAW = 0b110111111000, 0b100111111000, 0b100111000000
 """What of SET_POSITION_TARGET_LOCAL_NED is not to be ignored."""
 FORCED = 21196
 SET_EKF_SOURCE_SET = 42007
@@ -43,6 +43,8 @@ class Pilot:
     """The mode that holds a place by itself, sticks centred."""
     flown_in = ""
     """The mode that takes places to go to."""
+    forward = CENTRED
+    """Sticks that ask for two or three metres a second forward."""
 
     def __init__(self, ground: Ground, firmware: Simulator) -> None:
         self._ground, self._firmware = ground, firmware
@@ -108,6 +110,15 @@ class Pilot:
             lambda: np.linalg.norm(self._ground.believed_m - place_m) < within_m, timeout_s
         )
 
+    def send_to(self, place_m: Array) -> None:
+        """Tell it a place once, from where on the way and the heading are its own."""
+        self.stream(None)
+        message = mavlink.MAVLink_set_position_target_local_ned_message(
+            0, 1, 1, mavlink.MAV_FRAME_LOCAL_NED, PLACE, *place_m, *np.zeros(8)
+        )
+        for _ in range(SET_TIMES):
+            self._ground.send(message)
+
     def land(self, timeout_s: float = 60.0) -> bool:
         """Whether it landed and disarmed by itself."""
         self.stream(None)
@@ -148,6 +159,7 @@ class CopterPilot(Pilot):
     modes_to_arm_in = ("LOITER", "GUIDED")
     holds_in = "LOITER"
     flown_in = "GUIDED"
+    forward = 0.0, -0.25, 0.5, 0.0  # of its LOIT_SPEED of 12.5 m/s
 
     def __init__(self, ground: Ground, firmware: Simulator) -> None:
         super().__init__(ground, firmware)
@@ -184,6 +196,8 @@ class Px4Pilot(Pilot):
     modes_to_arm_in = ("POSCTL",)
     holds_in = "POSCTL"
     flown_in = "OFFBOARD"
+    forward = 0.0, 0.7, 0.5, 0.0  # of an MPC_VEL_MANUAL of 5 m/s, by its curve
+    higher = 0.0, 0.0, 0.75, 0.0  # half a metre a second or one
 
     def __init__(self, ground: Ground, firmware: Simulator) -> None:
         super().__init__(ground, firmware)
