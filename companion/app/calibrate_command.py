@@ -109,10 +109,11 @@ def calibrate(
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; --out wants a folder")
     gathered, called = GatheredViews(chart), source.name
-    frames = _frames(source) if isinstance(source, Path) else None
-    if frames is not None:
+    frames: FrameSource | None = None
+    if isinstance(source, Path):
+        frames = _frames(source)
         _search(frames, gathered, progress)
-    elif not isinstance(source, Path):
+    else:
         _watch(source, gathered, model, progress)
     views = _distinct_views(gathered, called)
     if isinstance(frames, Video):
