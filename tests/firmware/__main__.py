@@ -3,7 +3,8 @@
     ARDUCOPTER=…/arducopter PX4=…/px4 python -m tests.firmware EXPERIMENT … [--firmware px4]
 
 Each trial is in real time, and wants the whole computer: firmware, camera and companion share two
-cores. All that happened is left under --out, a folder a trial; runs.json gathers all figures, and
+cores. `--slowed 2` is for a computer too slow for it: time passes at half its rate for all of them.
+All that happened is left under --out, a folder a trial; runs.json gathers all figures, and
 index.html shows them.
 """
 
@@ -21,6 +22,7 @@ from tests.firmware.experiments import EXPERIMENTS
 from tests.firmware.figures import Figures, append_to
 from tests.firmware.page import write_page
 from tests.firmware.sent_poses import add_poses
+from tests.firmware.slowed_time import run_again_slowed, slowed_by
 from tests.firmware.trial import Conditions, Trial
 
 FIRMWARES = {"arducopter": "ARDUCOPTER", "px4": "PX4"}
@@ -44,7 +46,7 @@ def fly(
     add_poses(figures, folder / "cable.tlog", trial.ground.true)
     told = {"folder": folder.name, "version": version, "seed": conditions.seed,
             "wind_m_s": conditions.wind_m_s, "look": conditions.look, "perfect": conditions.perfect,
-            "parameters": dict(conditions.parameters)}  # fmt: skip
+            "slowed_by": slowed_by(), "parameters": dict(conditions.parameters)}  # fmt: skip
     append_to(out / "runs.json", experiment, firmware, told, figures.rows)
     write_page(out)
     return figures
@@ -64,11 +66,14 @@ def main() -> int:
     parser.add_argument("--backend")
     parser.add_argument("--parameter", action="append", default=[], metavar="NAME=VALUE")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument("--slowed", type=float, default=1.0, metavar="FACTOR",
+                        help="time passes slower by this factor (default 1)")  # fmt: skip
     parser.add_argument("--only", action="append", default=[], metavar="FAULT")
     options = parser.parse_args()
     missing = [each for each in (FIRMWARES[options.firmware],) if not os.environ.get(each)]
     if missing:
         sys.exit(f"${missing[0]} names no firmware built for its simulator")
+    run_again_slowed(options.slowed, options.out)
     given = {
         each.name: getattr(options, each.name)
         for each in dataclasses.fields(Conditions)
