@@ -24,6 +24,9 @@ from drivers.system.journal import INFO, WARNING, Journal
 PAGE = "companion.page.page_process"
 RELOAD, RESTART, VIEWER = b"reload\n", b"restart\n", b"viewer\n"
 """Lines that the page may write."""
+GIVE_WAY, TAKE_BACK = b"give way\n", b"take back\n"
+"""Lines that it is told: while the motors are armed it gets what processor time is left over."""
+ARMED_EVERY_S = 1.0
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 2.0, 60.0
 """Pause before it is started again; doubled while it ends soon."""
 SOON_S = 30.0
@@ -83,20 +86,31 @@ class PageChild:
             sys.executable, "-m", PAGE, limit=LONGEST_LINE,
             stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
         )  # fmt: skip
+        assert child.stdin is not None and child.stdout is not None
+        child.stdin.write(self._facts)
+        telling = asyncio.create_task(self._tell_armed(child.stdin))
         try:
-            assert child.stdin is not None and child.stdout is not None
-            child.stdin.write(self._facts)
-            with contextlib.suppress(ConnectionError):
-                await child.stdin.drain()
             while line := await child.stdout.readline():
                 self._take(line)
             return f"status {await child.wait()}"
         except ValueError:  # a line longer than any that it may write
             return "it wrote what it never writes"
         finally:
+            telling.cancel()
             with contextlib.suppress(ProcessLookupError):
                 child.kill()
             await child.wait()
+
+    async def _tell_armed(self, stdin: asyncio.StreamWriter) -> None:
+        """Tell it when the motors are armed, and when no longer."""
+        told = False
+        with contextlib.suppress(ConnectionError):  # it has ended, which is seen at its output
+            while True:
+                if self._armed() is not told:
+                    told = not told
+                    stdin.write(GIVE_WAY if told else TAKE_BACK)
+                await stdin.drain()
+                await asyncio.sleep(ARMED_EVERY_S)
 
     def _take(self, line: bytes) -> None:
         if line == VIEWER:

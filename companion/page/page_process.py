@@ -1,4 +1,8 @@
-"""Process of the page: serves it until its standard input ends, as the daemon does."""
+"""Process of the page: serves it until its standard input ends, as the daemon does.
+
+While the motors are armed it gets only the processor time that nobody else wants: a stage that
+wakes up then takes the core at once, and not after the page's turn of some milliseconds.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +22,18 @@ from companion.page.daemon_watch import DaemonWatch
 from companion.page.facts import Facts
 from companion.page.scene import Scene
 from companion.timing.clock import monotonic_s, wait_s
+from drivers.system.low_priority import all_threads_idle, may_take_back
 
 NICE = 15
 """Of a busy processor it gets a thirtieth of what a stage gets."""
 MEMORY_BYTES = 512 << 20
 """Most memory of its own: it ends then, and is started again."""
 MOST_FILES = 256
+GIVE_WAY = b"give way\n"
+"""Line of the daemon once the motors are armed; any other says that they no longer are."""
 AGAIN_S = 2.0
+MOST_UNREAD_BYTES = 32768
+"""Of a connection, in the kernel: the longest form is 10 kB, and all else is no request."""
 OUT_OF_MEMORY_FIRST = "800"
 """oom_score_adj(5): where memory is short, this ends before a stage does."""
 
@@ -44,7 +53,7 @@ def main() -> int:
     line = sys.stdin.buffer.readline()
     if not line:
         return 0
-    threading.Thread(target=_end_with_daemon, name="lifeline", daemon=True).start()
+    threading.Thread(target=_heed_daemon, name="lifeline", daemon=True).start()
     facts = Facts.of_line(line)
     try:
         asyncio.run(_serve(facts, _listener(facts.config.page.listen)))
@@ -73,7 +82,9 @@ def _listener(listen: str) -> socket.socket:
     while True:
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            return socket.create_server((host, int(port)), family=family, backlog=32)
+            listener = socket.create_server((host, int(port)), family=family, backlog=32)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, MOST_UNREAD_BYTES)
+            return listener
         except (OSError, OverflowError) as error:
             why = f"page.listen: {listen}: {getattr(error, 'strerror', None) or error}"
             if why != said:
@@ -82,10 +93,12 @@ def _listener(listen: str) -> socket.socket:
             wait_s(never, AGAIN_S)
 
 
-def _end_with_daemon() -> None:
-    stdin = sys.stdin.fileno()
-    while os.read(stdin, 4096):  # unbuffered: the interpreter cannot end while a buffer is read
-        pass
+def _heed_daemon() -> None:
+    """Give way while the motors are armed, as far as that can be undone; end with the daemon."""
+    stdin, heeds = sys.stdin.fileno(), may_take_back()
+    while words := os.read(stdin, 4096):  # unbuffered: the interpreter cannot end within a buffer
+        if heeds:
+            all_threads_idle(words.endswith(GIVE_WAY))
     os._exit(0)
 
 

@@ -1,9 +1,10 @@
-"""Lowest priority of a process for processor and disk."""
+"""Lowest priority of a process for processor and disk, and of this one's threads for a while."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+from concurrent.futures import ThreadPoolExecutor
 
 import psutil
 
@@ -14,3 +15,34 @@ def give_way(pid: int) -> None:
         os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
     with contextlib.suppress(OSError, psutil.Error):
         psutil.Process(pid).ionice(psutil.IOPRIO_CLASS_IDLE)
+
+
+def may_take_back() -> bool:
+    """True where this process may leave the idle class again; tried by a thread of its own.
+
+    The kernel asks for RLIMIT_NICE down to its nice level, or for CAP_SYS_NICE.
+    """
+
+    def tried() -> bool:
+        try:
+            for policy in (os.SCHED_IDLE, os.SCHED_OTHER):
+                os.sched_setscheduler(0, policy, os.sched_param(0))
+        except OSError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(tried).result()
+
+
+def all_threads_idle(idle: bool) -> None:
+    """Put all threads of this process into the idle class, or into the usual one."""
+    policy = os.SCHED_IDLE if idle else os.SCHED_OTHER
+    changed = True
+    while changed:  # one that was not changed yet may have started another meanwhile
+        changed = False
+        for thread in map(int, os.listdir("/proc/self/task")):
+            with contextlib.suppress(ProcessLookupError):  # it has ended
+                if os.sched_getscheduler(thread) != policy:
+                    os.sched_setscheduler(thread, policy, os.sched_param(0))
+                    changed = True

@@ -1,4 +1,8 @@
-"""A page that asks for what it is told to: the value of `daemon.flights` lists it."""
+"""A page that asks for what it is told to: the value of `daemon.flights` lists it.
+
+"end" ends it with status 7; "heed WORDS" waits for a line of the daemon, and ends it with 5 where
+that is another.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,10 @@ def main() -> None:
     for word in config_of_text(told["config"], "the daemon").daemon.flights.split(","):
         if word == "end":
             sys.exit(7)
+        if word.startswith("heed "):
+            if sys.stdin.readline() != word.removeprefix("heed ") + "\n":
+                sys.exit(5)
+            continue
         print(word, flush=True)
     sys.stdin.read()
 
