@@ -13,6 +13,7 @@ import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 from pathlib import Path
 
 from itsdangerous import BadSignature, URLSafeSerializer
@@ -57,10 +58,12 @@ class Access:
 
     def session(self, cookie: str | None, peer: str) -> Session:
         """The session of a request, by its cookie and the address it comes from."""
-        self._look_for_new_codes()
         least = Right.LOOK if is_here(peer) else Right.NONE
+        if not cookie:
+            return Session(least, "")
+        self._look_for_new_codes()
         try:
-            right, name = self._signer.loads(cookie or "")
+            right, name = self._signer.loads(cookie)
             return Session(max(Right(right), least), str(name))
         except (BadSignature, ValueError, TypeError):
             return Session(least, "")
@@ -126,6 +129,7 @@ class Access:
         return found.st_mtime_ns, found.st_ino
 
 
+@lru_cache(MOST_PEERS)
 def is_here(peer: str) -> bool:
     """True of an address of this machine."""
     try:

@@ -21,6 +21,13 @@ NOT_TAKEN_S = 20.0
 """Time for which a peer may take nothing of an answer."""
 KEEP_ALIVE_S = 15
 HEAD_BYTES = 16384
+REFUSED_S = 1.0
+"""Time for which a connection that brought no request is kept, unread: who sends rubbish without
+end is held by the flow control of TCP, instead of being refused anew a hundred times a second."""
+REFUSAL = (
+    b"HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain\r\nConnection: close\r\n\r\n"
+    b"this is no request"
+)
 _open: Counter[str] = Counter()
 """Connections by peer."""
 
@@ -30,6 +37,7 @@ class BoundedConnection(H11Protocol):
 
     _request_due: asyncio.TimerHandle | None = None
     _answer_due: asyncio.TimerHandle | None = None
+    _refused_until: asyncio.TimerHandle | None = None
     _counted = ""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -53,6 +61,8 @@ class BoundedConnection(H11Protocol):
             self._counted = ""
         self._request_came()
         self._answer_taken()
+        if self._refused_until is not None:
+            self._refused_until.cancel()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -62,6 +72,12 @@ class BoundedConnection(H11Protocol):
         super().data_received(data)
         if self.conn.their_state not in (h11.IDLE, h11.SEND_BODY):
             self._request_came()
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse what is no request, and read no more of it."""
+        self.transport.pause_reading()
+        self.transport.write(REFUSAL)
+        self._refused_until = self.loop.call_later(REFUSED_S, self.transport.abort)
 
     def pause_writing(self) -> None:
         """The peer does not take the answer as fast as it is made."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import socket
 from collections.abc import Callable, Mapping
@@ -18,6 +19,8 @@ MOST_BODY_BYTES = 65536
 """The longest form is that of all settings, some 10 kB."""
 ONE_PEER, ALL_PEERS = (60.0, 120.0), (120.0, 240.0)
 """Requests a second, and at once: an open view asks seven times a second, and loads four files."""
+REFUSED_S = 1.0
+"""Time until a request too many is refused: who waits for the answer asks no sooner again."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; "
     "base-uri 'none'; form-action 'self'; frame-ancestors 'none'",
@@ -46,6 +49,7 @@ class Gate:
             return
         headers, peer = Headers(scope=scope), (scope.get("client") or ("",))[0]
         if not self._requests.allows(peer, round(self._clock() * 1e9)):
+            await asyncio.sleep(REFUSED_S)
             answer = PlainTextResponse("too many requests", 429, {"Retry-After": "2"})
         elif not _is_short(headers):
             answer = PlainTextResponse("longer than any form here", 413, {"Connection": "close"})

@@ -56,6 +56,8 @@ class Scene:
         self._port = port
         self._lock = threading.Lock()
         self._looked_s = -LOOKED_S
+        self._told_picture: tuple[PictureItem | None, bytes] = None, b""
+        """A picture and its document, the same for all who look."""
         self._stop = threading.Event()
         self._clear("")
         self._thread = threading.Thread(target=self._run, name="scene", daemon=True)
@@ -68,15 +70,9 @@ class Scene:
             picture, n = self._picture, self._n_pictures
         if picture is None or n == number:
             return None
-        found = picture.found_px
-        step = max(1, -(-len(found) // MOST_FOUND))
-        document = {
-            "number": n,
-            "n_found": len(found),
-            "found": np.rint(found[::step]).astype(int).ravel().tolist(),
-            "jpeg": base64.b64encode(picture.jpeg).decode(),
-        }
-        return json.dumps(document, separators=(",", ":")).encode()
+        if self._told_picture[0] is not picture:
+            self._told_picture = picture, _picture_document(picture, n)
+        return self._told_picture[1]
 
     def from_above(self) -> bytes:
         """Path, points and place as JSON: whole centimetres north and east."""
@@ -199,6 +195,18 @@ class _Until(threading.Event):
     def is_set(self) -> bool:
         """True at the end of the page, or where the link is not wanted."""
         return self._stop.is_set() or not self._is_wanted()
+
+
+def _picture_document(picture: PictureItem, number: int) -> bytes:
+    found = picture.found_px
+    step = max(1, -(-len(found) // MOST_FOUND))
+    document = {
+        "number": number,
+        "n_found": len(found),
+        "found": np.rint(found[::step]).astype(int).ravel().tolist(),
+        "jpeg": base64.b64encode(picture.jpeg).decode(),
+    }
+    return json.dumps(document, separators=(",", ":")).encode()
 
 
 def _thinned_lines(lines: list[Array]) -> list[list[int]]:

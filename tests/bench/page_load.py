@@ -4,9 +4,11 @@
 
 Flies the camera and the autopilot of the tests in real time. In turns nobody looks at the page, and
 everything at once does: 20 clients that ask as an open view does, 20 that ask nothing or read
-nothing, and rubbish at 10 MB/s. Of each turn it prints the rate of poses that reached the
-autopilot, the 95th percentile from exposure to pose, and the memory (PSS) of all processes; at the
-end whether what it is with them lies within the spread without.
+nothing, and rubbish at 10 MB/s as far as it is taken. Who asks is a process of the lowest priority,
+as on a drone it is other machines: beside the camera and the autopilot of the tests it would make
+them late too. Of each turn it prints the rate of poses that reached the autopilot, the 95th
+percentile from exposure to pose, the memory (PSS) of all processes, and the processor time of the
+page; at the end whether what it is with them lies within the spread without.
 """
 
 from __future__ import annotations
@@ -18,14 +20,20 @@ import json
 import os
 import socket
 import statistics
+import subprocess
+import sys
 import tempfile
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import psutil
 
+from companion.daemon.page_child import PAGE
+from drivers.system.low_priority import give_way
 from tests.support.processes.paged import Paged
 
 N_LOOKING, N_HUNG = 20, 20
@@ -47,7 +55,7 @@ class Load:
             thread.start()
 
     def stop(self) -> None:
-        """End all of it."""
+        """End all of it; `answers` then has what came back."""
         self._over.set()
         for thread in self._threads:
             thread.join()
@@ -102,28 +110,56 @@ class Load:
         self.answers["rubbish MB"] = round(n_bytes / 1e6)
 
 
-def measured(paged: Paged, seconds: float, loaded: bool) -> tuple[float, float, float, float]:
-    """Poses a second, p95 (ms), memory of all processes and of the page (MB), in one turn."""
-    load = Load(paged.port) if loaded else None
-    began_ns = time.monotonic_ns()
-    late_ms = []
-    until_s = time.monotonic() + seconds
-    while time.monotonic() < until_s:
-        late_ms.append(paged.daemon.status()["pose_latency_p95_ms"] or 0.0)
-        time.sleep(1.0)
-    took_s = (time.monotonic_ns() - began_ns) * 1e-9
-    n = sum(got.monotonic_ns >= began_ns for got in paged.autopilot.of("ODOMETRY"))
+@contextlib.contextmanager
+def asked(port: int) -> Iterator[None]:
+    """All that asks, in a process of its own; prints what came back."""
+    command = [sys.executable, "-m", "tests.bench.page_load", "--ask", str(port)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as child:
+        yield
+        child.communicate()
+
+
+def ask(port: int) -> None:
+    """Be that process, until the standard input ends."""
+    give_way(0)
+    load = Load(port)
+    sys.stdin.read()
+    load.stop()
+    print("   ", dict(load.answers), flush=True)
+
+
+class Turn(NamedTuple):
+    """Measures of a turn."""
+
+    poses_hz: float
+    p95_ms: float
+    pss_mb: float
+    page_mb: float
+    page_cpu: float
+    """Share of a core."""
+
+
+def measured(paged: Paged, seconds: float, loaded: bool) -> Turn:
+    """One turn."""
     daemon = psutil.Process(paged.daemon.pid)
-    pss_mb, page_mb = 0.0, 0.0
-    for process in [daemon, *daemon.children(recursive=True)]:
-        mb = process.memory_full_info().pss / 1e6
-        pss_mb += mb
-        if "companion.page.page_process" in process.cmdline():
-            page_mb = mb
-    if load is not None:
-        load.stop()
-        print("   ", dict(load.answers))
-    return n / took_s, statistics.median(late_ms), pss_mb, page_mb
+    page = next(each for each in daemon.children(recursive=True) if PAGE in each.cmdline())
+    with asked(paged.port) if loaded else contextlib.nullcontext():
+        began_ns, cpu_s = time.monotonic_ns(), sum(page.cpu_times()[:2])
+        late_ms = []
+        until_s = time.monotonic() + seconds
+        while time.monotonic() < until_s:
+            late_ms.append(paged.daemon.status()["pose_latency_p95_ms"] or 0.0)
+            time.sleep(1.0)
+        took_s = (time.monotonic_ns() - began_ns) * 1e-9
+        n = sum(got.monotonic_ns >= began_ns for got in paged.autopilot.of("ODOMETRY"))
+        pss = {
+            each.pid: each.memory_full_info().pss / 1e6
+            for each in [daemon, *daemon.children(recursive=True)]
+        }
+        cpu_s = sum(page.cpu_times()[:2]) - cpu_s
+    return Turn(
+        n / took_s, statistics.median(late_ms), sum(pss.values()), pss[page.pid], cpu_s / took_s
+    )
 
 
 def main() -> None:
@@ -131,19 +167,24 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--dense", action="store_true", help="with the dense map")
+    parser.add_argument("--ask", type=int, metavar="PORT", help="be who asks, for this bench")
     given = parser.parse_args()
-    found: dict[bool, list[tuple[float, float, float, float]]] = {False: [], True: []}
+    if given.ask:
+        ask(given.ask)
+        return
+    found: dict[bool, list[Turn]] = {False: [], True: []}
     with tempfile.TemporaryDirectory() as folder, Paged(Path(folder), depth=given.dense) as paged:
         paged.until_served()
         paged.autopilot.arm()
         paged.daemon.until(lambda health: health["feedback"]["sending"], "poses", timeout_s=FLY_S)
         for number in range(given.rounds):
             for loaded in (False, True):
-                hz, p95_ms, pss_mb, page_mb = result = measured(paged, given.seconds, loaded)
-                found[loaded].append(result)
+                turn = measured(paged, given.seconds, loaded)
+                found[loaded].append(turn)
                 print(
-                    f"{number + 1} {'loaded' if loaded else 'alone '} {hz:6.2f} poses/s, p95"
-                    f" {p95_ms:5.1f} ms, {pss_mb:4.0f} MB in all, page {page_mb:3.0f} MB",
+                    f"{number + 1} {'loaded' if loaded else 'alone '} {turn.poses_hz:6.2f} poses/s,"
+                    f" p95 {turn.p95_ms:5.1f} ms, {turn.pss_mb:4.0f} MB in all, page"
+                    f" {turn.page_mb:3.0f} MB and {turn.page_cpu:5.1%} of a core",
                     flush=True,
                 )
     for index, name in ((0, "poses/s"), (1, "p95, ms")):

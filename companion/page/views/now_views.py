@@ -7,14 +7,17 @@ from collections.abc import Mapping
 from typing import Any
 
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from companion.page.remedies import OF_REASON, OTHER, remedy
 from companion.page.setup_steps import source
 from companion.page.views.rerun_views import viewer_link
 from companion.page.views.site import Site, is_number
+from companion.timing.clock import monotonic_s
 
+ABOVE_FRESH_S = 0.8
+"""Age at which the map from above is drawn anew; an open view asks once a second."""
 RECENT_S = 600.0
 """Age of warnings that are shown here; Health in the journal has all."""
 WORDS = {
@@ -28,6 +31,10 @@ class NowViews:
 
     def __init__(self, site: Site) -> None:
         self._site = site
+        self._panel_of: Mapping[str, Any] | None = None
+        self._panel_html = ""
+        self._above_lock = asyncio.Lock()
+        self._above_s, self._above_json = -ABOVE_FRESH_S, b""
 
     def routes(self) -> list[Route]:
         """Routes of this view."""
@@ -45,7 +52,11 @@ class NowViews:
         return await self._site.render(request, "now.html.j2", **await self._values())
 
     async def _panel(self, request: Request) -> Response:
-        return await self._site.render(request, "now_panel.html.j2", **await self._values())
+        status = await self._site.watch.status()
+        if status is not self._panel_of:  # all who look have the same one
+            self._panel_of = status
+            self._panel_html = self._site.part("now_panel.html.j2", **await self._values())
+        return HTMLResponse(self._panel_html)
 
     async def _armed(self, request: Request) -> Response:
         """true, false, or none where nobody knows: what a view may do changes with it."""
@@ -64,8 +75,11 @@ class NowViews:
 
     async def _above(self, request: Request) -> Response:
         await self._site.watch.status()
-        found = await asyncio.to_thread(self._site.scene.from_above)
-        return Response(found, media_type="application/json")
+        async with self._above_lock:
+            if monotonic_s() - self._above_s > ABOVE_FRESH_S:
+                self._above_json = await asyncio.to_thread(self._site.scene.from_above)
+                self._above_s = monotonic_s()
+        return Response(self._above_json, media_type="application/json")
 
     async def _map(self, request: Request) -> Response:
         is_web = self._site.facts.config.daemon.viewer == "web"

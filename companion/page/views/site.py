@@ -120,6 +120,10 @@ class Site:
         )  # fmt: skip
         return HTMLResponse(html, status_code)
 
+    def part(self, template: str, **values: Any) -> str:
+        """A template that shows the same to all, and is part of a view."""
+        return self._templates.get_template(template).render(**values)
+
     async def refused(self, request: Request, why: str, status_code: int) -> Response:
         """A page that says why something was not done."""
         missing = status_code == 404

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.page import bounded_server
+from companion.page import bounded_server, gate
 from tests.support.served_page import ELSEWHERE, HERE, ServedPage
 from tests.support.waiting import until
 
@@ -47,11 +47,27 @@ def test_it_serves(served: ServedPage) -> None:
     assert get(served) == 200
 
 
-def test_rubbish_is_refused(served: ServedPage, capfd: pytest.CaptureFixture[str]) -> None:
+def test_rubbish_is_refused(
+    served: ServedPage, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bounded_server, "REFUSED_S", 0.2)
     for rubbish in (b"\x00\xff" * 2000, b"GET\r\n\r\n", b"POST / HTTP/1.1\r\n\r\n", b"A" * 60000):
         assert b" 400 " in sent(served, rubbish)
     assert get(served) == 200
     assert capfd.readouterr().err == ""  # a line for each would drown the journal
+
+
+def test_rubbish_without_end_is_refused_once_and_not_read(served: ServedPage) -> None:
+    n_bytes, rubbish = 0, b"\x00\xff" * 32768
+    with socket.create_connection((HERE, served.port), timeout=10) as peer:
+        peer.sendall(rubbish[:2000])
+        assert peer.recv(65536).startswith(b"HTTP/1.1 400 ")
+        peer.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            while n_bytes < 64 << 20:  # more than the kernel keeps of one connection
+                n_bytes += peer.send(rubbish)
+        assert get(served) == 200
+    until(lambda: not served.server.server_state.connections)
 
 
 @pytest.mark.parametrize("head", [b"Content-Length: 70000", b"Content-Length: x"])
@@ -109,7 +125,8 @@ def test_there_are_so_many_connections_and_no_more(
     assert get(served) == 200
 
 
-def test_who_asks_too_often_waits(served: ServedPage) -> None:
+def test_who_asks_too_often_waits(served: ServedPage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "REFUSED_S", 0.0)
     answers = [served.ask("GET", "/pair", peer=ELSEWHERE).status for _ in range(300)]
     assert answers[0] == 200 and answers[-1] == 429
     assert served.ask("GET", "/pair", peer=HERE, headers={"host": HERE}).status == 200
