@@ -13,7 +13,7 @@ import numpy as np
 
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.resumption.checkpoint import CheckpointError
-from companion.estimation.site.site_use import SiteUse, wrong_metres
+from companion.estimation.site.site_use import SiteUse, contradiction, wrong_metres
 from companion.messages import (
     Bytes,
     Frame,
@@ -101,7 +101,7 @@ class _Localisation(Work):
                     f"{read.site.scale_factor:g} and n_levels = {read.site.n_levels}, and now they "
                     f"are {features.scale_factor:g} and {features.n_levels}"
                 )
-            if wrong := wrong_metres(read.site, setup.camera):
+            if wrong := wrong_metres(read.site, setup.camera) or contradiction(read.site):
                 raise SiteMapError(f"{setup.config.map.use}: {wrong}")
         except SiteMapError as error:
             if not setup.is_live:

@@ -12,7 +12,7 @@ import numpy as np
 
 from companion.app.maps.merged_maps import merged_map
 from companion.errors import InputError
-from companion.estimation.site.site_use import world_from_site
+from companion.estimation.site.site_use import contradiction, world_from_site
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Similarity
 from companion.products.atomic_file import write_atomically
@@ -69,12 +69,13 @@ def show(path: Path, as_json: bool) -> str:
 
 
 def verify(path: Path) -> tuple[str, bool]:
-    """A line for each damaged part of a map, or that it is whole; True if it is."""
+    """A line for each fault of a map, or that it is whole; True if it is."""
     path = map_path(path)
     read = read_site_map(path)
-    if not read.damaged:
-        return f"{path}: whole", True
-    return "\n".join(f"{path}: {each} is damaged" for each in read.damaged), False
+    faults = [f"{each} is damaged" for each in read.damaged]
+    if wrong := contradiction(read.site):
+        faults.append(wrong)
+    return "\n".join(f"{path}: {each}" for each in faults or ["whole"]), not faults
 
 
 def export(path: Path, out: Path) -> list[Path]:

@@ -25,6 +25,11 @@ MAX_FOCAL_OFF = 0.01
 """Relative difference of focal lengths of the same camera, calibrated twice."""
 N_LOOKED_AT = 50
 """Keyframes of which the errors of features are looked at: tens of thousands of these."""
+MAX_MEDIAN_CHI2 = 13.8
+"""Of the squared errors of features at their points: what one in a thousand exceeds by chance, and
+the median of a right map is 1.4."""
+N_COMPARED = 10
+"""Keyframes of which features are compared with their points: thousands of observations."""
 TIMES_OFF = 3
 """Comparisons in a row that contradict the map before it counts: a filter may leap once."""
 LOCATED = "located in the map of an earlier flight"
@@ -214,6 +219,28 @@ def wrong_metres(site: SiteMap, camera: Camera) -> str:
         f"{whose} focal length is a guess, and {theirs.focal_px:.0f} pixels of the map differ from "
         f"{camera.focal_px:.0f} of now by {100 * off:.1f} %, where its features allow "
         f"{100 * allowed:.1f} %: calibrate"
+    )
+
+
+def contradiction(site: SiteMap) -> str:
+    """Reason why what a map has seen is not what it says to be there; "" if none.
+
+    Its points are projected into some of its keyframes, and compared with the features there. A map
+    that was altered, or put together of two, is found by that.
+    """
+    chi2 = []
+    for keyframe in site.keyframes[:: 1 + len(site.keyframes) // N_COMPARED]:
+        seen = keyframe.point_ids >= 0
+        points = site.points.positions[keyframe.point_ids[seen]]
+        there = keyframe.camera_from_map.apply(points)
+        off = keyframe.normalised[seen] - there[:, :2] / there[:, 2:]
+        chi2.append((np.einsum("nij,nj->ni", keyframe.whitening[seen], off) ** 2).sum(1))
+    found = np.concatenate(chi2)
+    if len(found) == 0 or (median := float(np.median(found))) <= MAX_MEDIAN_CHI2:
+        return ""
+    return (
+        f"half of its features are further than {np.sqrt(median):.0f} standard deviations from "
+        "the points that they are said to see: it contradicts itself, make another"
     )
 
 

@@ -77,7 +77,19 @@ def by_a_guess(path: Path) -> None:
     write_site_map(path, replace(site, parts=(replace(site.parts[0], camera=camera),)))
 
 
-@pytest.mark.parametrize("spoil", [cut, newer, letter, Path.unlink, of_other_features, by_a_guess])
+def with_points_elsewhere(path: Path) -> None:
+    """Its points a fifth further from its middle, its keyframes where they were."""
+    site = read_site_map(path).site
+    points = site.points._replace(positions=1.2 * site.points.positions)
+    write_site_map(path, replace(site, points=points))
+
+
+SPOILT = [
+    cut, newer, letter, Path.unlink, of_other_features, by_a_guess, with_points_elsewhere,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("spoil", SPOILT)
 def test_a_flight_goes_on_without_it_and_a_replay_ends(
     path: Path, spoil: Callable[[Path], None]
 ) -> None:
