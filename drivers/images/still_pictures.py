@@ -16,6 +16,7 @@ from companion.products.atomic_file import write_atomically
 
 NAME = re.compile(r"image-(\d{6})\.jpg")
 QUALITY = 95
+MB, MIB = 10**6, 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,15 @@ class Still:
     t_ns: int
     path: Path
     why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Storage:
+    """Disk of the images, MiB; less is available than is free where some of it is reserved."""
+
+    total_mib: float
+    used_mib: float
+    available_mib: float
 
 
 class StillPictures:
@@ -46,14 +56,19 @@ class StillPictures:
         return self._newest
 
     @property
-    def free_mb(self) -> float:
-        """Megabytes for images that the disk still has; 0 where the folder cannot be."""
+    def storage(self) -> Storage | None:
+        """Disk that has the folder, or will have it; None where it cannot be looked at."""
         folder = next((p for p in (self.folder, *self.folder.parents) if p.is_dir()), Path("/"))
         try:
             found = os.statvfs(folder)
         except OSError:
-            return 0.0
-        return max(0.0, found.f_bavail * found.f_frsize / 1e6 - self._least_free_mb)
+            return None
+        block_mib = found.f_frsize / MIB
+        available_mib = found.f_bavail * block_mib - self._least_free_mb * MB / MIB
+        return Storage(
+            found.f_blocks * block_mib, (found.f_blocks - found.f_bfree) * block_mib,
+            max(0.0, available_mib),
+        )  # fmt: skip
 
     def request(self, done: Callable[[Still], None]) -> bool:
         """Keep the next frame; `done` is called in another thread. False while one is awaited."""
@@ -81,7 +96,8 @@ class StillPictures:
         try:
             bgr = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR) if frame.rgb.size else frame.grey
             _, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-            if self.free_mb <= 0:
+            storage = self.storage
+            if storage is None or storage.available_mib <= 0:
                 why = "the disk is full"
             else:
                 self.folder.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.pilot_messages import RECORDING_GOES_ON, RECORDING_NO_FLIGHT, PilotText
-from drivers.images.still_pictures import Still
+from drivers.images.still_pictures import Still, Storage
 from drivers.mavlink.camera_messages import CAPTURE_STATUS, SETTINGS, STORAGE
 from drivers.mavlink.ground.command_server import ACCEPTED, BUSY, DENIED, FAILED, Command, Done, Job
 from drivers.mavlink.status_text import status_text
@@ -27,8 +27,7 @@ CAPABILITIES: int = (
 )
 URL_BYTES = 205
 SINGLE = 1.0
-MIB = 1.048576
-"""In megabytes."""
+NO_STORAGE = Storage(0.0, 0.0, 0.0)
 
 
 class Stills(Protocol):
@@ -39,8 +38,8 @@ class Stills(Protocol):
         """Number of the newest image."""
 
     @property
-    def free_mb(self) -> float:
-        """Megabytes that there is room for."""
+    def storage(self) -> Storage | None:
+        """Disk of the images; None where it is not known."""
 
     def request(self, done: Callable[[Still], None]) -> bool:
         """Keep the next frame."""
@@ -132,18 +131,21 @@ class CameraCaptures:
 
     def _status(self) -> Any:
         now_ms, since_ms = self._boot_ms(), self._since_ms
+        storage = self._stills.storage or NO_STORAGE
         return mavlink.MAVLink_camera_capture_status_message(
             now_ms & 0xFFFFFFFF, int(self._is_taking), int(since_ms is not None), 0.0,
-            0 if since_ms is None else (now_ms - since_ms) & 0xFFFFFFFF, self._stills.free_mb / MIB,
-            self._stills.n_taken,
+            0 if since_ms is None else (now_ms - since_ms) & 0xFFFFFFFF,
+            storage.available_mib, self._stills.n_taken,
         )  # fmt: skip
 
     def _storage(self) -> Any:
-        """STORAGE_INFORMATION: what there is room for; sizes in MiB, the others are not known."""
+        """STORAGE_INFORMATION, sizes in MiB; the speeds of the disk are not known."""
+        storage, status = self._stills.storage, mavlink.STORAGE_STATUS_READY
+        if storage is None:  # then a ground station is to heed no sizes
+            storage, status = NO_STORAGE, mavlink.STORAGE_STATUS_NOT_SUPPORTED
         return mavlink.MAVLink_storage_information_message(
-            self._boot_ms() & 0xFFFFFFFF, 1, 1, mavlink.STORAGE_STATUS_READY, math.nan, math.nan,
-            self._stills.free_mb / MIB, math.nan, math.nan, mavlink.STORAGE_TYPE_OTHER,
-            b"companion",
+            self._boot_ms() & 0xFFFFFFFF, 1, 1, status, storage.total_mib, storage.used_mib,
+            storage.available_mib, math.nan, math.nan, mavlink.STORAGE_TYPE_OTHER, b"companion",
         )  # fmt: skip
 
     def _settings(self) -> Any:

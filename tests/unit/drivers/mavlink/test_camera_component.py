@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import queue
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
@@ -20,9 +21,14 @@ from companion.pilot_messages import RECORDING_GOES_ON
 from companion.timing.clock import FlightClock
 from drivers.images.still_pictures import Still, StillPictures
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.mavlink.camera_captures import CAPABILITIES, FlightRecording
+from drivers.mavlink.camera_captures import (
+    CAPABILITIES,
+    NOTHING_RECORDED,
+    CameraCaptures,
+    FlightRecording,
+)
 from drivers.mavlink.camera_component import CAMERA, CameraComponent
-from drivers.mavlink.camera_messages import CameraStream
+from drivers.mavlink.camera_messages import CAPTURE_STATUS, STORAGE, CameraStream
 from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
 from tests.support.autopilot.fake_wire import free_port
 
@@ -205,3 +211,26 @@ def test_an_image_that_cannot_be_kept_is_said_to_have_failed(tmp_path: Path) -> 
     stills.frame(FRAME)
     assert found.get(timeout=WITHIN_S).why == "the disk is full"
     assert not list(tmp_path.iterdir())
+
+
+def test_its_storage_is_the_disk_less_what_is_reserved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    captures = CameraCaptures(
+        StillPictures(tmp_path / "images", least_free_mb=1000),
+        NOTHING_RECORDED, lambda: 7, lambda _: 0, lambda _: None,
+    )  # fmt: skip
+    blocks = 4096, 4096, 8_000_000, 3_000_000, 2_500_000  # of all, free, free for this user
+    monkeypatch.setattr(os, "statvfs", lambda _: os.statvfs_result((*blocks, 0, 0, 0, 0, 255)))
+    told = captures.messages[STORAGE]()
+    assert told.status == mavlink.STORAGE_STATUS_READY
+    sizes = told.total_capacity, told.used_capacity, told.available_capacity
+    assert sizes == pytest.approx((31250.0, 19531.25, 9765.625 - 953.674), abs=0.01)
+    status = captures.messages[CAPTURE_STATUS]()
+    assert status.available_capacity == told.available_capacity
+
+    def gone(_: Path) -> os.statvfs_result:
+        raise OSError
+
+    monkeypatch.setattr(os, "statvfs", gone)
+    assert captures.messages[STORAGE]().status == mavlink.STORAGE_STATUS_NOT_SUPPORTED
