@@ -17,6 +17,7 @@ from typing import Any, Literal
 from companion.errors import InputError
 from companion.page.daemon_watch import DaemonWatch
 from companion.page.facts import Facts
+from drivers.system.low_priority import processor_time_s
 
 LOWEST = "companion.page.lowest_process"
 LONGEST_LINE = 1 << 16
@@ -42,6 +43,10 @@ class Work:
     """All that its lines have told, newer values over older ones."""
     why: str = ""
     """Reason why it failed."""
+    ran_s: float = 0.0
+    """Time since it began,"""
+    processor_s: float = 0.0
+    """and processor time that it had of it."""
 
 
 class BackgroundWork:
@@ -88,7 +93,7 @@ class BackgroundWork:
     async def _run(
         self, work: Work, arguments: Sequence[str], after: Callable[[Work], None]
     ) -> None:
-        watching = asyncio.create_task(self._end_when_armed(work))
+        watching = asyncio.create_task(self._watch_over(work))
         try:
             command, *rest = arguments
             await self._command(work, [command, *self._facts.arguments(), *rest])
@@ -136,9 +141,15 @@ class BackgroundWork:
 
         asyncio.get_running_loop().call_later(END_S, kill)
 
-    async def _end_when_armed(self, work: Work) -> None:
+    async def _watch_over(self, work: Work) -> None:
+        """Note its processor time, and end it once the motors are armed."""
+        loop = asyncio.get_running_loop()
+        began_s = loop.time()
         while True:
             await asyncio.sleep(LOOK_EVERY_S)
+            work.ran_s = loop.time() - began_s
+            if self._child is not None:
+                work.processor_s = max(work.processor_s, processor_time_s(self._child.pid))
             if work.state == "running" and await self._watch.is_armed():
                 work.state, work.why = "failed", ARMED
                 if self._child is not None:

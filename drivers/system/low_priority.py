@@ -17,6 +17,14 @@ def give_way(pid: int) -> None:
         psutil.Process(pid).ionice(psutil.IOPRIO_CLASS_IDLE)
 
 
+def processor_time_s(pid: int) -> float:
+    """Processor time that a process has had; 0 where it has ended."""
+    with contextlib.suppress(psutil.Error):
+        times = psutil.Process(pid).cpu_times()
+        return float(times.user + times.system)
+    return 0.0
+
+
 def may_take_back() -> bool:
     """True where this process may leave the idle class again; tried by a thread of its own.
 

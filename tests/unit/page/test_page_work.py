@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 
 from companion.calibration.chart import parse_chart
+from companion.page import background_work
 from companion.page.views.lens_views import BOARD
+from drivers.system.low_priority import processor_time_s
 from tests.support.served_page import ELSEWHERE, Answer, ServedPage
 
 NAME = "00001-2026-11-19T10-00-00Z"
@@ -52,6 +55,17 @@ def test_a_work_that_fails_says_why(served: ServedPage, begin: str, panel: str, 
     assert post(served, begin).status == 303
     until(served, panel, words)
     assert not list((served.flights / NAME).glob("replay-*"))
+
+
+def test_a_replay_tells_how_much_processor_time_it_gets(
+    served: ServedPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(background_work, "LOOK_EVERY_S", 0.01)
+    told = processor_time_s(os.getpid())
+    assert told > 0 and processor_time_s(0) == 0
+    assert post(served, f"/flights/{NAME}/replay").status == 303
+    until(served, f"/flights/{NAME}/replay/panel", " s of processor time in ")
+    until(served, f"/flights/{NAME}/replay/panel", "not an MCAP file")
 
 
 def test_nothing_heavy_is_begun_while_armed_or_without_the_right(served: ServedPage) -> None:
