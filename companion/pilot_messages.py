@@ -110,6 +110,7 @@ MARKER_LOST = PilotMessage(NOTICE, "landing marker lost")
 
 OBSTACLES_KNOWN = PilotMessage(INFO, "obstacles in view are reported")
 OBSTACLES_UNKNOWN = PilotMessage(WARNING, "obstacles unknown: none is reported")
+OBSTACLES_NEVER_FREE = PilotMessage(WARNING, "no sector can be free: check the mount")
 
 # -- camera and autopilot -----------------------------------------------------------------
 

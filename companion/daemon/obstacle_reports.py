@@ -17,11 +17,12 @@ from companion.flight_notes import GateStep, ObstaclePoints
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array
 from companion.messages import DepthMap, Frame, MapUpdate, ObstaclesSeen, PointChunk, Track
+from companion.obstacles.clear_sight import can_see_free
 from companion.obstacles.depth_points import obstacle_points
 from companion.obstacles.obstacle_edges import nothing_seen, seen_around
 from companion.obstacles.obstacle_finder import ObstacleFinder, Round
 from companion.obstacles.obstacle_sectors import FREE_M, MAX_M, UNKNOWN_CM, Obstacles
-from companion.pilot_messages import OBSTACLES_KNOWN, OBSTACLES_UNKNOWN
+from companion.pilot_messages import OBSTACLES_KNOWN, OBSTACLES_NEVER_FREE, OBSTACLES_UNKNOWN
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.measurements.obstacle_distance import obstacle_messages
@@ -66,12 +67,15 @@ class ObstacleReports:
         self._known_ns: int | None = None
         self._n_parts = 0
         self._is_shown = self._is_told = False
+        self._never_free = False
+        """PX4 will not move level by what this camera can see, and its pilot is not told yet."""
         self._seen_ns: int | None = None
 
     def restart(self, camera: Camera | None) -> None:
         """Begin another flight with another map."""
         self._finder = None if camera is None else ObstacleFinder(camera)
         self._known_ns, self._n_parts, self._is_shown, self._seen_ns = None, 0, False, None
+        self._never_free = camera is not None and not can_see_free(camera)
 
     def take(self, message: Track | MapUpdate | DepthMap | PointChunk) -> None:
         """Take a track, a map update, a depth map or points."""
@@ -134,6 +138,8 @@ class ObstacleReports:
 
         ArduPilot flies into the unknown as if nothing stood there, and says nothing.
         """
+        if self._never_free and self._firmware == "px4" and self._link.say(OBSTACLES_NEVER_FREE()):
+            self._never_free = False
         unknown = isinstance(found, Obstacles) and not (found.distances_cm != UNKNOWN_CM).any()
         if found is not None and not unknown:
             self._seen_ns = t_ns

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose
 from companion.obstacles.newest_sight import Seen
 from companion.obstacles.obstacle_sectors import (
@@ -29,6 +30,21 @@ FIELD_FROM_M = 4.0
 """Distance from which on the whole band of heights is in the field that is looked at."""
 PERHAPS_M = 1.05 * FREE_M + 0.3
 """By its error, what is measured nearer than that may stand up to `FREE_M` away."""
+
+
+def can_see_free(camera: Camera) -> bool:
+    """True if the camera of a level vehicle has all of that field in view, straight where it looks.
+
+    Without, no sector is ever free but after a climb or descent. True where the mount is unknown.
+    """
+    mount = camera.body_from_camera
+    if mount is None:
+        return True
+    ahead = mount.rotation[:2, 2]
+    up = np.array([ABOVE_M, -BELOW_M]) / FIELD_FROM_M * np.linalg.norm(ahead)
+    edges = np.c_[np.tile(ahead, (2, 1)), -up] @ mount.rotation
+    rows = camera.project(edges)[:, 1]
+    return bool(((rows >= 0) & (rows < camera.height)).all())
 
 
 def free_sectors(grid: OccupancyGrid, seen: Seen, world_from_body: Pose) -> NDArray[np.bool_]:

@@ -17,7 +17,7 @@ from companion.config import Config, FeedbackConfig
 from companion.daemon.obstacle_reports import UNKNOWN_AFTER_NS, ObstacleReports
 from companion.flight_notes import GateStep, ObstaclePoints
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, Pose, Similarity
+from companion.geometry.transforms import Array, Pose, Similarity, rotation_from_vector
 from companion.messages import (
     Bytes,
     DepthMap,
@@ -377,6 +377,26 @@ def test_the_pilot_is_told_when_obstacles_are_known_no_more(
     assert said[1:] == ["Companion: obstacles unknown: none is reported"]
     approach.fly(0.5)
     assert said[2:] == ["Companion: obstacles in view are reported"]
+
+
+@pytest.mark.parametrize("firmware", ["px4", "ardupilot"])
+def test_the_pilot_is_told_of_a_mount_that_never_lets_px4_move(
+    firmware: Firmware, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    approach, said = Approach(), list[str]()
+
+    def say(text: PilotText) -> bool:
+        said.append(text.text)
+        return True
+
+    monkeypatch.setattr(approach.link, "say", say)
+    approach.link.vehicle = Vehicle(1, firmware, True, "")
+    down = Pose(rotation_from_vector(np.array([0.0, -1.0, 0.0])) @ FORWARD.rotation, np.zeros(3))
+    approach.reports.restart(replace(CAMERA, body_from_camera=down))
+    approach.now()
+    approach.now()
+    told = ["Companion: no sector can be free: check the mount"]
+    assert said == (told if firmware == "px4" else [])
 
 
 @pytest.mark.parametrize("radius_m", [0.05, 0.1])

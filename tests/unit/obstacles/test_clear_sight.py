@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, Pose
-from companion.obstacles.clear_sight import free_sectors
+from companion.geometry.transforms import Array, Pose, rotation_from_vector, yaw_rotation
+from companion.obstacles.clear_sight import can_see_free, free_sectors
 from companion.obstacles.newest_sight import Seen
 from companion.obstacles.obstacle_sectors import FREE_M
 from companion.obstacles.occupancy_grid import CELL_M, FADES_NS, MOST, OccupancyGrid
@@ -184,3 +184,22 @@ def test_open_country_is_free_below_the_sky_and_a_pole_before_it_is_not() -> Non
     found = found_by(lambda n: np.array([0.0, 0.08 * n - 0.88, -3.0]), country)[-1]
     assert found[[-2, -1]].all()
     assert not found[1] and not found[2]
+
+
+@pytest.mark.parametrize(
+    ("down_deg", "to_the_right_deg", "sees"),
+    [(0, 0, True), (14, 0, True), (14, 100, True), (18, 0, False), (-18, 0, True), (-21, 0, False)],
+)
+def test_the_mount_must_let_the_field_be_seen(
+    down_deg: float, to_the_right_deg: float, sees: bool
+) -> None:
+    """With 30 degrees to each edge it may look 16 degrees down, and 19 up."""
+    down = rotation_from_vector(np.array([0.0, -np.radians(down_deg), 0.0]))
+    turned = yaw_rotation(np.radians(to_the_right_deg)) @ down
+    mount = Pose(turned @ AHEAD.rotation, np.zeros(3))
+    camera = Camera(640, 480, 417.0, 417.0, 319.5, 239.5, body_from_camera=mount)
+    assert can_see_free(camera) is sees
+
+
+def test_an_unknown_mount_is_not_judged() -> None:
+    assert can_see_free(replace(NARROW, body_from_camera=None))
