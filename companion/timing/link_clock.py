@@ -41,7 +41,8 @@ STAMP_S = 1e-3
 """Resolution of most stamps: milliseconds."""
 PRIOR_DRIFT = 0.02
 """Prior standard deviation of the drift: simulators on a loaded machine."""
-HUBER = 1.5
+HUBER, ROUNDS = 1.5, 3
+"""Sigmas beyond which a point counts less, and fits of a line with weights by the one before."""
 PROOF_NS, PROOF_WITH_ANSWERS_NS, PROOF_N = 400_000_000, 1_000_000_000, 5
 """Time and stamps after which another clock is accepted; longer where answers would show it sooner.
 """
@@ -136,13 +137,14 @@ class ClockFilter:
 
     def one_way(self, remote_ns: int, receive_ns: int) -> bool:
         """Add a stamped message. False: its stamp is not of the current clock."""
-        if not self._is_current(remote_ns, receive_ns):
+        expected_ns = self.host_ns(remote_ns)
+        if not self._is_current(remote_ns, receive_ns, expected_ns):
             if not self._other_clock_proven(remote_ns, receive_ns):
                 return False
             self._switch_clock(remote_ns, receive_ns)
+            expected_ns = None
         self._other_clock = None
         self._count(remote_ns, receive_ns)
-        expected_ns = self.host_ns(remote_ns)
         if expected_ns is not None:
             self._excess_ns.append(max(0, receive_ns - expected_ns))
         better = self._add_delay(remote_ns, receive_ns)
@@ -159,7 +161,10 @@ class ClockFilter:
             return None
         anchor_ns, host_ns = self._line
         passed_ns = remote_ns - anchor_ns
-        return host_ns + passed_ns + round(self._slope * passed_ns - self._slew_left_ns(passed_ns))
+        slew_left = min(1.0, max(0.0, 1 - passed_ns / self._slew_ns))
+        return (
+            host_ns + passed_ns + round(self._slope * passed_ns - self._slew_error_ns * slew_left)
+        )
 
     def report(self) -> ClockReport | None:
         """State of synchronisation; None until known. `offset_s` is host minus autopilot."""
@@ -176,12 +181,11 @@ class ClockFilter:
 
     # -- which clock it is -----------------------------------------------------------------------
 
-    def _is_current(self, remote_ns: int, receive_ns: int) -> bool:
+    def _is_current(self, remote_ns: int, receive_ns: int, expected_ns: int | None) -> bool:
         if self._latest_ns is None:
             return True
         if remote_ns < self._latest_ns - REBOOT_NS:
             return False
-        expected_ns = self.host_ns(remote_ns)
         if expected_ns is None:  # no line yet: only a coarse check
             passed_ns = receive_ns - self._first_receive_ns
             return remote_ns < self._latest_ns + passed_ns + REBOOT_NS
@@ -231,10 +235,11 @@ class ClockFilter:
             while points and now_ns - points[0].remote_ns > WINDOW_NS:
                 points.popleft()
         line = self._line_of(self._delays, now_ns, np.full(len(self._delays), STAMP_S))
-        # the minimum delay is unobservable; the excess of others indicates its size
-        excess_ns = _median(sorted(self._excess_ns)) if self._excess_ns else 0.0
-        systematic_ns = math.hypot(1e9 * STAMP_S, excess_ns)
-        if self._answers:
+        if not self._answers:
+            # the minimum delay is unobservable; the excess of others indicates its size
+            excess_ns = _median(sorted(self._excess_ns)) if self._excess_ns else 0.0
+            systematic_ns = math.hypot(1e9 * STAMP_S, excess_ns)
+        else:
             half_ns = np.array([each.cost_ns for each in self._answers])
             least_ns = float(half_ns.min())
             sigma_s = np.maximum(1e-9 * (half_ns - least_ns), MIN_SIGMA_S)
@@ -248,8 +253,8 @@ class ClockFilter:
 
     def _line_of(self, points: deque[_Point], now_ns: int, sigma_s: Array) -> _Line:
         base_ns = points[-1].offset_ns
-        t_s = np.array([(each.remote_ns - now_ns) * 1e-9 for each in points])
-        offset_s = np.array([(each.offset_ns - base_ns) * 1e-9 for each in points])
+        t_s = (np.array([each.remote_ns for each in points]) - now_ns) * 1e-9
+        offset_s = (np.array([each.offset_ns for each in points]) - base_ns) * 1e-9
         value_s, slope, spread_s = _line_at_end(t_s, offset_s, sigma_s)
         return _Line(base_ns + 1e9 * value_s, slope, 1e9 * spread_s)
 
@@ -263,10 +268,6 @@ class ClockFilter:
         self._slew_ns = max(SLEW_S * 1e9, abs(error_ns) / MAX_SLEW)
         self.drift_ppm = -1e6 * slope / (1 + slope)
         self.sigma_ns = math.hypot(self._fit_sigma_ns, error_ns)
-
-    def _slew_left_ns(self, passed_ns: int) -> float:
-        """Remainder of the current correction."""
-        return self._slew_error_ns * min(1.0, max(0.0, 1 - passed_ns / self._slew_ns))
 
 
 def _keep_best(points: deque[_Point], point: _Point) -> bool:
@@ -282,18 +283,22 @@ def _keep_best(points: deque[_Point], point: _Point) -> bool:
 
 
 def _line_at_end(t_s: Array, value_s: Array, sigma_s: Array) -> tuple[float, float, float]:
-    """Value at time 0, slope and standard deviation of the value, over the selected window."""
+    """Value at time 0, slope and standard deviation of the value, over the selected window.
+
+    `t_s` (N,) in order; each window has its newest.
+    """
     low, high = -math.inf, math.inf
     best: tuple[float, float, float] | None = None
     n_before = 0
     sigma_s = np.hypot(sigma_s, _scatter(t_s, value_s, sigma_s))
-    for length_s in LENGTHS_S:
-        inside = t_s >= -length_s
-        n = int(np.count_nonzero(inside))
+    moments = np.stack([np.ones(len(t_s)), t_s, t_s**2, value_s, t_s * value_s])
+    by_sigma = sigma_s**-2
+    for begin in np.searchsorted(t_s, [-each for each in LENGTHS_S]).tolist():
+        n = len(t_s) - begin
         if n == n_before:
             continue
         n_before = n
-        found = _robust_line(t_s[inside], value_s[inside], sigma_s[inside])
+        found = _robust_line(moments[:, begin:], sigma_s[begin:], by_sigma[begin:])
         margin = CONFIDENCE * found[2]
         low, high = max(low, found[0] - margin), min(high, found[0] + margin)
         if low > high and best is not None:
@@ -325,19 +330,19 @@ def _median(ordered: Sequence[float] | Array) -> float:
     return float((ordered[(n - 1) // 2] + ordered[n // 2]) / 2)
 
 
-def _robust_line(t_s: Array, value_s: Array, sigma_s: Array) -> tuple[float, float, float]:
-    weight = by_sigma = sigma_s**-2
-    squared_s2 = t_s**2
-    offset, slope, spread = 0.0, 0.0, 0.0
-    for _ in range(3):
+def _robust_line(moments: Array, sigma_s: Array, by_sigma: Array) -> tuple[float, float, float]:
+    """Value at time 0, slope and standard deviation; `moments` (5, N) are 1, t, t^2, v and t v."""
+    t_s, value_s = moments[1], moments[3]
+    limit_s = HUBER * sigma_s
+    weight = by_sigma
+    for round_ in range(ROUNDS):
         # a line with a prior on its slope, solved about time 0
-        total, first = float(weight.sum()), float(weight @ t_s)
-        second = float(weight @ squared_s2) + PRIOR_DRIFT**-2
-        right = float(weight @ value_s), float((weight * t_s) @ value_s)
+        total, first, squares, *right = (moments @ weight).tolist()
+        second = squares + PRIOR_DRIFT**-2
         determinant = total * second - first**2
         offset = (second * right[0] - first * right[1]) / determinant
         slope = (total * right[1] - first * right[0]) / determinant
-        residual = np.abs(value_s - offset - slope * t_s) / sigma_s
-        spread = math.sqrt(second / determinant)
-        weight = by_sigma / np.maximum(1.0, residual / HUBER)
-    return offset, slope, spread
+        if round_ < ROUNDS - 1:
+            residual_s = np.abs(value_s - offset - slope * t_s)
+            weight = by_sigma / np.maximum(1.0, residual_s / limit_s)
+    return offset, slope, math.sqrt(second / determinant)
