@@ -46,6 +46,7 @@ from companion.runtime.stage_protocol import (  # noqa: E402
 from companion.runtime.stage_work import Work, WorkModule, module_of  # noqa: E402
 from companion.runtime.stages import (  # noqa: E402
     NICE_WITHOUT_LOSS,
+    UNREAD_BYTES,
     Stage,
     drop_policy,
     lossless,
@@ -55,6 +56,9 @@ from companion.timing.clock import monotonic_s, wait_s  # noqa: E402
 
 IN_BYTES = 64 << 20
 """Queue in a stage's process: fifty frames of 640x480."""
+TOLD_BYTES = UNREAD_BYTES // 2
+"""Shared memory taken since the daemon was told: each telling wakes a thread there, and the other
+half is room for three frames of 640x480."""
 REPORT_EVERY_S = 1.0
 LOWEST_NICE = 19
 """Lowest priority of all: runs only where nothing else wants the processor."""
@@ -140,13 +144,15 @@ class _Loop:
 
     def read(self, daemon: socket.socket, send: Callable[[Any], None]) -> None:
         """Put what comes into the inbox, until the daemon is gone."""
-        n_taken = 0
+        n_taken = n_told = 0
         try:
             while True:
                 parcels = Parcel.receive(daemon)
                 if parcels[0].is_shared:  # which comes alone
                     n_taken += parcels[0].n_bytes
-                    send(Taken(n_taken))
+                    if n_taken - n_told >= TOLD_BYTES:
+                        n_told = n_taken
+                        send(Taken(n_taken))
                 self._inbox.put_all(parcels)
         except (OSError, EOFError):
             if not self._work.outlives_daemon:
