@@ -32,6 +32,7 @@ from drivers.camera.camera_feed import CameraFeed
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.system.journal import Journal
 from drivers.system.system_load import SystemLoad
+from drivers.system.ticks import tick
 
 GOVERN_NS = 1_000_000_000
 MAX_ARRIVALS = 64
@@ -225,7 +226,7 @@ class HealthWatch:
             pids = {"daemon": 0} | (flight.pids if flight is not None else {})
             self.load = await loop.run_in_executor(None, self._load_reader.read, pids)
             self._step_governor()
-            await asyncio.sleep(GOVERN_NS * 1e-9)
+            await tick(GOVERN_NS * 1e-9)
 
     def _step_governor(self) -> None:
         flight, now_ns = self._flights.current, self._clock.now_ns()

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
-
 from companion.meters import LatencyMeter
 from companion.timing.clock import FlightClock
+from drivers.system.ticks import tick
 
 TICK_S = 0.05
 """A hundred measurements in the window of the percentile; each wakes the loop."""
@@ -14,7 +13,5 @@ TICK_S = 0.05
 async def measure_loop_delay(clock: FlightClock, meter: LatencyMeter) -> None:
     """Measure by how much the loop wakes up late, repeatedly; ends by cancellation."""
     while True:
-        asked_ns = clock.now_ns() + round(TICK_S * 1e9)
-        await asyncio.sleep(TICK_S)
-        now_ns = clock.now_ns()
-        meter.add(now_ns, max(now_ns - asked_ns, 0) * 1e-6)
+        late_s = await tick(TICK_S)
+        meter.add(clock.now_ns(), max(late_s, 0.0) * 1e3)

@@ -26,6 +26,7 @@ from companion.pilot_messages import OBSTACLES_KNOWN, OBSTACLES_NEVER_FREE, OBST
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.measurements.obstacle_distance import obstacle_messages
+from drivers.system.ticks import tick
 
 OBSTACLES_HZ = 10.0
 UNKNOWN_AFTER_NS = 3_000_000_000
@@ -96,7 +97,7 @@ class ObstacleReports:
         """Send until cancelled."""
         loop = asyncio.get_running_loop()
         while True:
-            await asyncio.sleep(1.0 / OBSTACLES_HZ)
+            await tick(1.0 / OBSTACLES_HZ)
             if self._link.alive:
                 look = self.look()
                 self.tell(look, *await loop.run_in_executor(None, look.found))

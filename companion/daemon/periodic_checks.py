@@ -20,6 +20,7 @@ from drivers.camera.camera_feed import CameraFeed
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.system.journal import ERROR, WARNING, Journal
 from drivers.system.service_manager import ServiceManager
+from drivers.system.ticks import tick
 
 EVERY_S = 0.2
 START_S = 180.0
@@ -54,7 +55,7 @@ class PeriodicChecks:
         """Check until cancelled."""
         began_ns = self._clock.now_ns()
         while True:
-            await asyncio.sleep(EVERY_S)
+            await tick(EVERY_S)
             now_ns = self._clock.now_ns()
             if self._link_watch is not None:
                 self._link_watch.step(now_ns)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 from collections import deque
 from typing import Any
@@ -12,6 +11,7 @@ from companion.daemon.health_watch import HealthWatch
 from companion.flight_notes import HealthNote, LinkBytes
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.system.ticks import tick
 
 EVERY_S = 1.0
 LEAD_NS = 10_000_000_000
@@ -36,7 +36,7 @@ class RecorderNotes:
     async def run(self) -> None:
         """Record health once a second, until cancelled."""
         while True:
-            await asyncio.sleep(EVERY_S)
+            await tick(EVERY_S)
             self._flights.take(HealthNote(self._clock.now_ns(), self._document()))
 
     def _on_bytes(self, outgoing: bool, data: bytes, monotonic_ns: int) -> None:

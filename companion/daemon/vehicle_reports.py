@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -34,6 +33,7 @@ from drivers.mavlink.message_requests import (
 )
 from drivers.mavlink.wire.wire import run_together
 from drivers.system.own_addresses import own_addresses
+from drivers.system.ticks import tick
 from drivers.video.rtsp_server import PATH
 
 EVERY_NETWORK = ("0.0.0.0", "::", "")
@@ -90,7 +90,7 @@ class VehicleReports:
     async def _report(self) -> None:
         credit = 0.0
         while True:
-            await asyncio.sleep(TICK_S)
+            await tick(TICK_S)
             credit = min(credit + self.computer_hz * TICK_S, 1.0)
             if self._link.alive and credit > 1.0 - 1e-6:
                 credit = 0.0

@@ -33,6 +33,7 @@ from drivers.mavlink.status_text import TextLimit, status_text
 from drivers.mavlink.vehicle import Firmware, Vehicle, is_autopilot, vehicle_of
 from drivers.mavlink.wire.message_port import MavlinkPort
 from drivers.mavlink.wire.wire import run_together
+from drivers.system.ticks import tick
 from drivers.system.within import within
 from drivers.telemetry.gimbal_messages import GIMBAL_IDS
 from drivers.telemetry.live_samples import LiveSamples
@@ -290,17 +291,17 @@ class AutopilotLink:
             elif said_as != self.port.identity or now_ns >= due_ns:
                 said_as, due_ns = self.port.identity, now_ns + HEARTBEAT_NS
                 self.send(self.heartbeat())
-            await asyncio.sleep(HEARTBEAT_TICK_S)
+            await tick(HEARTBEAT_TICK_S)
 
     async def _compare_clocks(self) -> None:
         while True:
             if self.vehicle is not None:
                 self._clocks.ask(self.vehicle.system_id)
-            await asyncio.sleep(TIMESYNC_S)
+            await tick(TIMESYNC_S)
 
     async def _watch(self) -> None:
         while True:
-            await asyncio.sleep(min(WATCH_S, self._config.silent_after_s / 4))
+            await tick(min(WATCH_S, self._config.silent_after_s / 4))
             now_ns = self._clock.now_ns()
             silent_s = (now_ns - self._heard_ns) * 1e-9
             if self.alive and silent_s > self._config.silent_after_s:

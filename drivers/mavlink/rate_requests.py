@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Awaitable, Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -15,6 +14,7 @@ from drivers.mavlink.commands import NO_ANSWER, REFUSALS
 from drivers.mavlink.imu_rate import ImuNews, ImuRate
 from drivers.mavlink.message_rates import MessageRates
 from drivers.mavlink.wire.message_port import MavlinkPort
+from drivers.system.ticks import tick
 from drivers.telemetry.mavlink_samples import wanted
 
 PAUSE_S = 0.1
@@ -48,7 +48,7 @@ class RateRequests:
             elif self._imu is not None:
                 room = imu_room(self._config, self._port.capacity_bytes_per_s, heard)
                 self._tell_of_imu(self._imu.step(self._rates, room), now_ns)
-            await asyncio.sleep(PAUSE_S)
+            await tick(PAUSE_S)
 
     def came(self, message_id: int, is_sample: bool) -> None:
         """Count a message; those that make samples have a rate to keep."""
@@ -70,7 +70,7 @@ class RateRequests:
         """Request a message at a rate; at 0, what the autopilot sends by itself."""
         result = await self._request(message_id, 1e6 / rate_hz if rate_hz else 0.0)
         if result == NO_ANSWER and not rate_hz:
-            await asyncio.sleep(PAUSE_S)
+            await tick(PAUSE_S)
             return
         now_ns = self._clock.now_ns()
         refused = result in REFUSALS
@@ -82,7 +82,7 @@ class RateRequests:
             name = mavlink.mavlink_map[message_id].msgname
             self._warn(Warned(now_ns, "autopilot does not send a message", name))
         if result == NO_ANSWER:
-            await asyncio.sleep(PAUSE_S)
+            await tick(PAUSE_S)
 
     def _tell_of_imu(self, news: ImuNews | None, now_ns: int) -> None:
         if news is not None and news.detail != self._said_of_imu:

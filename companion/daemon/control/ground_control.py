@@ -61,6 +61,7 @@ from drivers.mavlink.ground.ground_requests import GroundRequests
 from drivers.mavlink.ground.mission_server import MissionServer
 from drivers.mavlink.ground.parameter_server import NOT_NOW, OUT_OF_RANGE, SET, ParameterServer
 from drivers.system.journal import INFO, WARNING, Journal
+from drivers.system.ticks import tick
 
 MAPPING, NEW_MAP, SNAPSHOT, BUDGET = 31010, 31011, 31012, 31013
 """MAV_CMD_USER_1 to MAV_CMD_USER_4."""
@@ -146,7 +147,7 @@ class GroundControl:
         answering = asyncio.ensure_future(self._requests.run())
         try:
             while not answering.done():
-                await asyncio.sleep(STEP_S)
+                await tick(STEP_S)
                 self._new_map.step()
                 self._snapshots.step()
             answering.result()

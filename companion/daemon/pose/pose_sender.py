@@ -34,6 +34,7 @@ from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_height import AutopilotHeight
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.measurements.pose_messages import pose_messages
+from drivers.system.ticks import tick
 
 TICK_S, IDLE_TICK_S = 0.002, 0.05
 """Between two polls of the gate."""
@@ -152,8 +153,8 @@ class PoseSender(Sender):
             due_ns = self._gate.due_ns
             wait_s = IDLE_TICK_S
             if due_ns is not None:  # a frame that comes meanwhile only puts it off
-                wait_s = min(max(1e-9 * (due_ns - self._clock.now_ns()), TICK_S), IDLE_TICK_S)
-            await asyncio.sleep(wait_s)
+                wait_s = max(1e-9 * (due_ns - self._clock.now_ns()), TICK_S)
+            await (asyncio.sleep(wait_s) if wait_s < IDLE_TICK_S else tick(IDLE_TICK_S))
             self.step()
 
     def step(self) -> None:

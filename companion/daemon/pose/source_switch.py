@@ -6,7 +6,6 @@ event loop.
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Collection
 
 from companion.config import GpsConfig, Measurement
@@ -18,6 +17,7 @@ from companion.flight_notes import GateStep
 from companion.messages import Warned
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.system.ticks import tick
 
 TICK_S = 0.1
 """Interval of looks."""
@@ -68,7 +68,7 @@ class SourceSwitch(Sender):
     async def run(self) -> None:
         """Switch when due; until cancelled."""
         while True:
-            await asyncio.sleep(TICK_S)
+            await tick(TICK_S)
             await self.step()
 
     async def step(self) -> None:

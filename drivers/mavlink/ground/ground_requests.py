@@ -6,7 +6,6 @@ ignored, and answers go out at a rate that leaves the link to the poses.
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 from typing import Any
 
@@ -19,9 +18,10 @@ from drivers.mavlink.ground.mission_server import MISSIONS, MissionServer
 from drivers.mavlink.ground.parameter_server import ParameterServer
 from drivers.mavlink.ground.request_limit import request_limit
 from drivers.mavlink.wire.message_port import MavlinkPort
+from drivers.system.ticks import tick
 
-TICK_S = 0.025
-"""Interval of parameters and waypoints: 1.5 to 2 kB/s."""
+TICK_S, IDLE_TICK_S = 0.025, 0.05
+"""Interval of parameters and waypoints: 1.5 to 2 kB/s; and while none waits."""
 WARN_EVERY_NS = 10_000_000_000
 TOO_MANY = "more is asked of the companion over MAVLink than it answers"
 COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
@@ -83,8 +83,9 @@ class GroundRequests:
 
     async def run(self) -> None:
         """Send answers that wait, until cancelled."""
+        waiting = None
         while True:
-            await asyncio.sleep(TICK_S)
+            await tick(TICK_S if waiting is not None else IDLE_TICK_S)
             for answer in self._commands.step(self._clock.now_ns()):
                 self._port.send(answer)
             waiting = self._missions.next_message() or self._parameters.next_message()
