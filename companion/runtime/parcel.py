@@ -25,7 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from companion.telemetry import TELEMETRY, Telemetry
+from companion.flight_notes import GateStep, LinkBytes
+from companion.geometry.transforms import Pose
+from companion.messages import Frame, FrameTracked, Odometry, Track, TrackRefined
+from companion.telemetry import TELEMETRY
 
 INLINE_BYTES = 32 << 10
 """Larger messages are shared; below, mapping costs more than a copy. A packet of those together and
@@ -51,17 +54,21 @@ def _array_parts(array: np.ndarray[Any, Any]) -> Any:
     return array.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
 
 
-def _sample_parts(sample: Telemetry) -> Any:
-    """Parts of a sample for the pickler: those that it is made of, and no list of its fields."""
-    kind = type(sample)
-    return kind, _VALUES_OF[kind](sample)
+def _note_parts(note: Any) -> Any:
+    """Parts of a small message for the pickler: those that it is made of, and no list of fields."""
+    kind = type(note)
+    return kind, _VALUES_OF[kind](note)
 
 
-_VALUES_OF = {kind: attrgetter(*(each.name for each in fields(kind))) for kind in TELEMETRY}
+_NOTES: tuple[type, ...] = (
+    *TELEMETRY, LinkBytes, GateStep, Odometry, Frame, FrameTracked, Track, TrackRefined, Pose,
+)  # fmt: skip
+"""Messages that come many times a second, and their poses."""
+_VALUES_OF = {kind: attrgetter(*(each.name for each in fields(kind))) for kind in _NOTES}
 
 
 _PARTS_OF: dict[type, Callable[[Any], Any]] = {
-    np.ndarray: _array_parts, **dict.fromkeys(TELEMETRY, _sample_parts),
+    np.ndarray: _array_parts, **dict.fromkeys(_NOTES, _note_parts),
 }  # fmt: skip
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 
-import numpy as np
-
 from companion.messages import NO_PICTURE, Frame, FrameOverdue, Message
 from companion.telemetry import Telemetry
 
@@ -39,7 +37,8 @@ class OverdueFrames:
         """Take the arrival of a frame."""
         if self._newest is not None:
             self._intervals_ns.append(now_ns - self._newest[1])
-            self._period_ns = int(np.median(self._intervals_ns))
+            ordered, n = sorted(self._intervals_ns), len(self._intervals_ns)
+            self._period_ns = (ordered[(n - 1) // 2] + ordered[n // 2]) // 2
         self._newest = frame.seq, now_ns, max(now_ns - frame.t_ns, 0)
 
     def due_ns(self) -> int | None:

@@ -120,8 +120,8 @@ def _attitude_quaternion(message: Any) -> Telemetry | None:
 
 
 def _rates(message: Any) -> Array | None:
-    rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
-    return rates if np.isfinite(rates).all() else None
+    rates = message.rollspeed, message.pitchspeed, message.yawspeed
+    return np.array(rates) if all(map(math.isfinite, rates)) else None
 
 
 def _highres_imu(message: Any) -> Telemetry | None:
@@ -140,10 +140,11 @@ def _scaled_imu(message: Any) -> Telemetry:
 
 def _local_position(message: Any) -> Telemetry:
     position = np.array([message.x, message.y, message.z])
-    velocity = np.array([message.vx, message.vy, message.vz])
+    velocity = message.vx, message.vy, message.vz
     return PositionSample(
-        0, PositionSource.LOCAL, position, velocity if np.isfinite(velocity).all() else None
-    )
+        0, PositionSource.LOCAL, position,
+        np.array(velocity) if all(map(math.isfinite, velocity)) else None,
+    )  # fmt: skip
 
 
 def _global_position(message: Any) -> GeodeticFix | None:

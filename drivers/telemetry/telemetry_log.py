@@ -167,7 +167,7 @@ def is_finite(content: Telemetry | GeodeticFix) -> bool:
     if isinstance(content, PositionSample):
         return _are_finite(content.position_ned_m)
     return all(
-        np.isfinite(value)
+        math.isfinite(value)
         for name in content.__slots__
         if isinstance(value := getattr(content, name), float)
     )
