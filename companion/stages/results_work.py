@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from companion.errors import StageError
-from companion.messages import Message, PointChunk
+from companion.messages import Frame, Message, PointChunk
 from companion.messages.run_facts import RunFacts
 from companion.products.flight_result import FlightResult
 from companion.runtime.stage_protocol import (
@@ -24,6 +24,10 @@ from companion.stages.cloud_snapshots import CloudSnapshots
 from companion.streaming.viewer import FileViewer
 from drivers.system.file_pages import give_back_library_pages
 
+PICTURE_EVERY_NS = 60_000_000
+"""Least interval of pictures in the viewer file in flight, as viewers get them: to encode and log
+each frame takes half of this stage's processor time."""
+
 
 class _Results(Work):
     def __init__(self, setup: Setup) -> None:
@@ -32,6 +36,7 @@ class _Results(Work):
             raise StageError("the results need a folder")
         self._folder, self._voxel_m = setup.folder, setup.config.cloud.voxel_m
         self._is_live = setup.is_live
+        self._drawn_ns = -PICTURE_EVERY_NS
         self._open = ExitStack()
         self._folder.mkdir(parents=True, exist_ok=True)
         self._result = FlightResult(self._folder, setup.config.cloud.memory_mb)
@@ -62,8 +67,15 @@ class _Results(Work):
         if isinstance(message, PointChunk):
             message = kept(message)
         self._result.take(message)
-        self._viewer_file.take(message)
+        if not isinstance(message, Frame) or self._is_drawn(message):
+            self._viewer_file.take(message)
         return self._snapshots.step()
+
+    def _is_drawn(self, frame: Frame) -> bool:
+        if self._is_live and frame.t_ns - self._drawn_ns < PICTURE_EVERY_NS:
+            return False
+        self._drawn_ns = frame.t_ns
+        return True
 
     def finish(self, finish: Finish) -> Iterable[Message]:
         try:
