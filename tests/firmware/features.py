@@ -236,9 +236,9 @@ FEATURES: dict[str, tuple[Callable[[Trial, Figures], None], Conditions]] = {
         settings=("feedback.global_position=sensor",),
     )),
     "wall": (wall, BEFORE_A_WALL),
-    "wall_px4": (wall, replace(BEFORE_A_WALL, parameters={
+    "wall_px4": (wall, replace(BEFORE_A_WALL, pitch_deg=-12.0, parameters={
         "CP_DIST": 2.4, "MPC_VEL_MANUAL": 5,  # 1.5 m, and what docs/autopilots.md adds
-    })),
+    })),  # 12 degrees down it sees what must be free, as docs/autopilots.md tells
     "wall_around": (wall_around, replace(BEFORE_A_WALL, parameters={
         "PRX1_TYPE": 2, "PRX_FILT": 0, "AVOID_ENABLE": 0, "OA_TYPE": 1, "OA_BR_LOOKAHEAD": 8,
         "OA_MARGIN_MAX": 2.4, "WPNAV_SPEED": 250, "GUID_OPTIONS": 64,
