@@ -180,13 +180,15 @@ class Health:
 
     def to_json(self) -> dict[str, Any]:
         """Plain types; a number that is not finite is null."""
-        document = _plain(dataclasses.asdict(self))
+        document = _plain(self)
         document["load"]["temperature_c"] = _plain(self.load.temperature_c)
         document["load"]["memory_share"] = _plain(self.load.memory_share)
         return dict(document)
 
 
 def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return {name: _plain(getattr(value, name)) for name in value.__dataclass_fields__}
     if isinstance(value, dict):
         return {str(key): _plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):

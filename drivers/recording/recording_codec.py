@@ -49,11 +49,13 @@ _LENS_WORDS = {
     Distortion.EQUIDISTANT: "equidistant",
 }
 _KINDS = {telemetry_topic(kind): kind for kind in TELEMETRY}
+_JSON = json.JSONEncoder(allow_nan=False, separators=(",", ":"))
+_AS_THEY_ARE = {int, str, bool, type(None)}
 
 
 def json_bytes(values: Mapping[str, Any]) -> bytes:
     """JSON object, in which nan and infinities are null."""
-    return json.dumps(_plain(values), allow_nan=False, separators=(",", ":")).encode()
+    return _JSON.encode(_plain(values)).encode()
 
 
 def sample_topic(sample: Telemetry) -> str:
@@ -204,6 +206,10 @@ def _set_pose(pose: Any, place: Similarity) -> None:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, float):  # most of all, and what is a mapping is slow to tell
+        return float(value) if math.isfinite(value) else None
+    if type(value) in _AS_THEY_ARE:
+        return value
     if isinstance(value, Mapping):
         return {str(key): _plain(each) for key, each in value.items()}
     if isinstance(value, np.ndarray):
@@ -212,8 +218,6 @@ def _plain(value: Any) -> Any:
         return [_plain(each) for each in value]
     if isinstance(value, Enum):
         return value.value
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
     return value
 
 
