@@ -16,7 +16,12 @@ from typing import Any
 import pytest
 
 from companion.app.devices_command import opencl_lines
-from companion.compute.compute_devices import choose_devices, unwritable_cache
+from companion.compute.compute_devices import (
+    _known,
+    _measured,
+    choose_devices,
+    unwritable_cache,
+)
 from companion.compute.device_probe import listed_devices, probed
 from companion.compute.device_verdict import (
     circumstances,
@@ -271,7 +276,10 @@ else:
 
 
 class Measuring:
-    """Selects the device of this computer, measured by a program that counts its calls."""
+    """Measures the device of this computer as a selection does, by a program that counts calls.
+
+    The device itself is not opened, of which what is kept says nothing.
+    """
 
     def __init__(self, folder: Path) -> None:
         best = next(
@@ -286,8 +294,9 @@ class Measuring:
     def n(self) -> int:
         """Measurements during a selection now."""
         before = len(self._log.read_text())
-        devices = choose_devices(OpenclConfig(), self.said.append, program=self._program)
-        assert devices.current is not None
+        listed, _ = listed_devices(self._program)
+        found = _measured(listed, _known(listed, listed), listed, self.said.append, self._program)
+        assert in_order(found)
         return (len(self._log.read_text()) - before) // len("measured\n")
 
 
