@@ -10,8 +10,8 @@ from companion.telemetry import Telemetry
 from companion.timing.clock import monotonic_s
 
 HELD_S = 0.02
-"""Samples gather for this long, or until another message: localisation takes them with its next
-frame only, which never waits for more than a few of them to be opened."""
+"""Samples gather for this long, or until another message but bytes of the link: localisation takes
+them with its next frame only, which never waits for more than a few of them to be opened."""
 MOST_HELD = 64
 
 

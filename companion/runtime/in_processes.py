@@ -20,7 +20,7 @@ from companion.runtime.stages import START_S, Death, Stage
 from companion.telemetry import TELEMETRY, Telemetry
 from companion.timing.clock import monotonic_s
 
-MAP = "MapUpdate"
+MAP, READS = "MapUpdate", "LinkReads"
 STALLED = "it hung for {:.0f} s and was ended"
 NO_PROCESS = "no process could be started for it: {}"
 LONGEST_WAIT_S = 30.0
@@ -140,7 +140,8 @@ class InProcesses:
 
     def publish(self, parcel: Parcel) -> None:
         """Pass a closed message to all stages that listen to it."""
-        self._samples.let_go()
+        if parcel.kind != READS:  # which have gathered for longer than samples do
+            self._samples.let_go()
         if parcel.kind != MAP:
             self._offer(parcel)
             return

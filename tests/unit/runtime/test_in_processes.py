@@ -17,6 +17,7 @@ import psutil
 import pytest
 
 from companion.config import Config
+from companion.flight_notes import LinkReads
 from companion.messages import Frame, MapUpdate
 from companion.runtime import gathered_samples, in_processes, stage_start
 from companion.runtime.gathered_samples import Samples
@@ -433,6 +434,7 @@ def test_samples_gather_until_another_message(fly: Fly, monkeypatch: pytest.Monk
     frame = Frame(1, 1, np.zeros((4, 6), np.uint8), np.zeros((4, 6, 3), np.uint8))
     for t_ns in range(70):
         flight.processes.take(ArmedSample(t_ns, True))
+    flight.processes.take(LinkReads(0, ()))  # makes none of them go
     flight.processes.take(LandedSample(70, True))
     flight.processes.publish(Parcel.of(frame))
     assert offered["source"] == [list(range(64)), list(range(64, 70))]
