@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from tests.firmware import manoeuvres
 from tests.firmware.faults import FAULTS, suffer
-from tests.firmware.features import DEGREE_M, FEATURES, OWN_SOURCES, up_by_gps
+from tests.firmware.features import BEFORE_A_WALL, DEGREE_M, FEATURES, OWN_SOURCES, up_by_gps
 from tests.firmware.figures import Figures, strayed_m
 from tests.firmware.pilots import SET_EKF_SOURCE_SET
 from tests.firmware.trial import Conditions, Trial
@@ -225,6 +226,7 @@ PX4_PARAMETERS = {
 EXPERIMENTS: dict[str, tuple[Flown, Conditions]] = {
     "take_off": (take_off, Conditions()),
     "square": (square, Conditions()),
+    "square_avoiding": (square, replace(BEFORE_A_WALL, landmarks="")),
     "tour": (tour, Conditions()),
     "wander": (wander, Conditions()),
     "faults": (faults, Conditions()),
