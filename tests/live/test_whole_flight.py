@@ -29,6 +29,7 @@ from tests.support.processes.flying import STOP_S
 from tests.support.processes.program import Run, refused
 from tests.support.processes.strain import Strain
 from tests.support.reference.scoring import Trajectory, read_ply, read_tum, score
+from tests.support.waiting import until
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 TRUTH = read_tum(SAMPLE / "truth" / "world_from_camera.tum")
@@ -113,8 +114,13 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
                  "--set", f"expert.daemon.socket={daemon.socket}"],
                 capture_output=True, text=True, check=True, timeout=20,
             ).stdout  # fmt: skip
-            with urllib.request.urlopen(f"http://127.0.0.1:{metrics_port}/metrics") as answer:
-                out.metrics = answer.read().decode()
+
+            def is_sending() -> bool:
+                with urllib.request.urlopen(f"http://127.0.0.1:{metrics_port}/metrics") as answer:
+                    out.metrics = answer.read().decode()
+                return "companion_feedback_sending 1.0" in out.metrics
+
+            until(is_sending, "poses, by the metrics")  # a busy computer may be late for one
             with Daemon(folder, *settings) as second:  # with the socket of the first, and armed
                 out.second = second.ended(60)
             wait_until(DISARMS_S)
@@ -218,7 +224,6 @@ def test_health_while_flying(flown: Flown) -> None:
     assert "ArduPilot" in autopilot["detail"]
     for row in ("localisation", "camera", "autopilot", "event loop"):
         assert row in flown.table
-    assert "companion_feedback_sending 1.0" in flown.metrics
     assert 'companion_source_state{source="camera",state="running"} 1.0' in flown.metrics
 
 
