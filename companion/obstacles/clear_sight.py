@@ -35,10 +35,11 @@ PERHAPS_M = 1.05 * FREE_M + 0.3
 def can_see_free(camera: Camera) -> bool:
     """True if the camera of a level vehicle has all of that field in view, straight where it looks.
 
-    Without, no sector is ever free but after a climb or descent. True where the mount is unknown.
+    Without, no sector is ever free but after a climb or descent. Neither an unknown mount nor a
+    gimbal is judged: True.
     """
     mount = camera.body_from_camera
-    if mount is None:
+    if mount is None or camera.gimbal is not None:
         return True
     ahead = mount.rotation[:2, 2]
     up = np.array([ABOVE_M, -BELOW_M]) / FIELD_FROM_M * np.linalg.norm(ahead)

@@ -49,13 +49,14 @@ class NowViews:
         ]
 
     async def _now(self, request: Request) -> Response:
-        return await self._site.render(request, "now.html.j2", **await self._values())
+        values = self._values(await self._site.watch.status())
+        return await self._site.render(request, "now.html.j2", **values)
 
     async def _panel(self, request: Request) -> Response:
         status = await self._site.watch.status()
         if status is not self._panel_of:  # all who look have the same one
+            self._panel_html = self._site.part("now_panel.html.j2", **self._values(status))
             self._panel_of = status
-            self._panel_html = self._site.part("now_panel.html.j2", **await self._values())
         return HTMLResponse(self._panel_html)
 
     async def _armed(self, request: Request) -> Response:
@@ -86,8 +87,7 @@ class NowViews:
         rerun = viewer_link(request.headers.get("host", "")) if is_web else ""
         return await self._site.render(request, "map.html.j2", rerun=rerun)
 
-    async def _values(self) -> dict[str, Any]:
-        status = await self._site.watch.status()
+    def _values(self, status: Mapping[str, Any]) -> dict[str, Any]:
         good, line = headline(status, self._site.watch.problem)
         return {
             "good": good, "line": line, "rows": rows(status), "advice": advice(status),

@@ -357,16 +357,23 @@ def test_before_anything_is_known_all_is_unknown() -> None:
     assert set(approach.fly(1e-9 * UNKNOWN_AFTER_NS + 1.0, 0.0, tracked=False)) == {UNKNOWN}
 
 
-def test_the_pilot_is_told_when_obstacles_are_known_no_more(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    approach, said = Approach(), list[str]()
+def said_by(approach: Approach, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Texts to the pilot from now on."""
+    said: list[str] = []
 
     def say(text: PilotText) -> bool:
         said.append(text.text)
         return True
 
     monkeypatch.setattr(approach.link, "say", say)
+    return said
+
+
+def test_the_pilot_is_told_when_obstacles_are_known_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    approach = Approach()
+    said = said_by(approach, monkeypatch)
     approach.now()
     assert said == []  # nothing is lost that never was there
     approach.fly(2.0)
@@ -383,13 +390,8 @@ def test_the_pilot_is_told_when_obstacles_are_known_no_more(
 def test_the_pilot_is_told_of_a_mount_that_never_lets_px4_move(
     firmware: Firmware, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    approach, said = Approach(), list[str]()
-
-    def say(text: PilotText) -> bool:
-        said.append(text.text)
-        return True
-
-    monkeypatch.setattr(approach.link, "say", say)
+    approach = Approach()
+    said = said_by(approach, monkeypatch)
     approach.link.vehicle = Vehicle(1, firmware, True, "")
     down = Pose(rotation_from_vector(np.array([0.0, -1.0, 0.0])) @ FORWARD.rotation, np.zeros(3))
     approach.reports.restart(replace(CAMERA, body_from_camera=down))

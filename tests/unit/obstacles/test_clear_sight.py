@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.geometry.camera import Camera
+from companion.geometry.gimbal import Gimbal
 from companion.geometry.transforms import Array, Pose, rotation_from_vector, yaw_rotation
 from companion.obstacles.clear_sight import can_see_free, free_sectors
 from companion.obstacles.newest_sight import Seen
@@ -201,5 +202,8 @@ def test_the_mount_must_let_the_field_be_seen(
     assert can_see_free(camera) is sees
 
 
-def test_an_unknown_mount_is_not_judged() -> None:
+def test_an_unknown_mount_is_not_judged_nor_a_gimbal() -> None:
     assert can_see_free(replace(NARROW, body_from_camera=None))
+    shut = replace(NARROW, height=100)
+    assert not can_see_free(shut)
+    assert can_see_free(replace(shut, gimbal=Gimbal()))
