@@ -1,4 +1,4 @@
-"""Lowest priority of a process for processor and disk, and of this one's threads for a while."""
+"""Priority of a process: the lowest for processor and disk, for a while, and back from it."""
 
 from __future__ import annotations
 
@@ -15,6 +15,12 @@ def give_way(pid: int) -> None:
         os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
     with contextlib.suppress(OSError, psutil.Error):
         psutil.Process(pid).ionice(psutil.IOPRIO_CLASS_IDLE)
+
+
+def take_turn(pid: int, levels: int) -> None:
+    """Take a process by so many nice levels before this one, where the kernel allows it."""
+    with contextlib.suppress(PermissionError, ProcessLookupError):
+        os.setpriority(os.PRIO_PROCESS, pid, os.getpriority(os.PRIO_PROCESS, 0) - levels)
 
 
 def processor_time_s(pid: int) -> float:

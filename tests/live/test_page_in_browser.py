@@ -17,6 +17,7 @@ from tests.support.processes.paged import Paged
 
 pytestmark = [
     pytest.mark.continues,
+    pytest.mark.alone,  # a flight, a browser and the page's doctor fill two cores
     pytest.mark.skipif(not CHROMIUM.exists(), reason="there is no Chromium: apt install chromium"),
 ]
 PHONE = 390

@@ -71,13 +71,16 @@ for (const form of document.forms) {
 }
 
 // What may be changed depends on the motors: the view is loaded anew when they are armed or
-// disarmed, unless somebody is filling in a form.
+// disarmed, unless somebody is filling in a form, or has just gone to another view (which loading
+// this one would take back; a download leaves as well, and stays).
 let typed = false;
+let left = -Infinity;
+addEventListener("beforeunload", () => { left = performance.now(); });
 document.addEventListener("input", (event) => { typed = typed || Boolean(event.target.form); });
 if (document.body.dataset.armed) {
   again(2500, async () => {
     const armed = await (await ask("/now/armed")).text();
-    if (armed === document.body.dataset.armed) { return; }
+    if (armed === document.body.dataset.armed || performance.now() - left < 10000) { return; }
     if (!typed) { location.reload(); return; }
     document.body.dataset.armed = armed;
     for (const button of document.querySelectorAll("main form button")) { button.disabled = armed !== "false"; }
