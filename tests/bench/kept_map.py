@@ -162,10 +162,11 @@ def merged(flights: Path, work: Path) -> None:
     off_m = rms(found, true, Similarity.identity())
     print(f"  in its own world {off_m:.3f} m, as a whole {world_m:.2f} m")
     alone = []
-    for n, (name, path) in enumerate(zip(MERGED, paths, strict=True)):
+    flights_of = [part.flight for part in both.parts]
+    for name, path in zip(MERGED, paths, strict=True):
         site = read_site_map(path).site
         before, true_before = keyframes_of(site, flights)
-        own = both.part_of == n
+        own = both.part_of == flights_of.index(name)
         alone.append((before, true_before))
         by_own = similarity(found[own], true[own])
         print(

@@ -30,6 +30,7 @@ from companion.products.site_map_file import (
 from companion.products.site_map_rows import SiteHead
 from companion.products.trajectory_file import trajectory_tum
 from companion.slam.loop.loop_closure import MIN_SHARED
+from companion.slam.map.site_flights import pixel_m
 from companion.slam.map.site_map import SiteMap
 from companion.slam.mapping.site_merge import merge_sites, shared_points
 from companion.slam.mapping.site_prune import prune_site
@@ -144,33 +145,46 @@ class Join:
 
 
 def merge(paths: Sequence[Path], out: Path, as_json: bool = False) -> str:
-    """Merge maps, in this order, into a new file; how they were joined, and what each flight gave.
+    """Merge maps into a new file; how they were joined, and what each flight gave.
 
-    InputError where one shows no place that is seen in those before it, or too little of one.
+    They are joined from the coarsest to the finest, as `merge_sites` wants it, as far as each shows
+    a place of those before. InputError where one shows none, or too little of one.
     """
-    merged = read_site_map(map_path(paths[0])).site
-    joins = []
-    for path in paths[1:]:
-        other = read_site_map(map_path(path)).site
-        if (other.scale_factor, other.n_levels) != (merged.scale_factor, merged.n_levels):
+    left = [(path, read_site_map(map_path(path)).site) for path in paths]
+    left.sort(key=lambda each: -pixel_m(each[1]))
+    (first, merged), *left = left
+    for path, site in left:
+        if (site.scale_factor, site.n_levels) != (merged.scale_factor, merged.n_levels):
             raise InputError(f"{path}: it was made with other features.scale_factor or n_levels")
-        apart = world_from_site(other.georeference.origin, merged.georeference.origin)
-        try:
-            both = merge_sites(merged, other, apart)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
-        if both is None:
-            raise InputError(f"{path}: no place in it is seen in {', '.join(map(str, paths[:1]))}")
-        n = len(merged.keyframes)
-        n_shared = len(shared_points(both.keyframes[:n], both.keyframes[n:]))
-        moved = _moved(merged, other, both, apart)
-        joins.append(Join(str(path), n_shared, n_shared < MIN_SHARED, moved))
-        merged = both
+    joins: list[Join] = []
+    while left:
+        for n, (path, other) in enumerate(left):
+            apart = world_from_site(other.georeference.origin, merged.georeference.origin)
+            try:
+                both = merge_sites(merged, other, apart)
+            except InputError as error:
+                raise InputError(f"{path}: {error}") from error
+            if both is not None:
+                joins.append(_joined(path, merged, other, both, apart))
+                merged = both
+                del left[n]
+                break
+        else:
+            alone = ", ".join(str(path) for path, _ in left)
+            before = ", ".join([str(first), *(each.map for each in joins)])
+            raise InputError(f"{alone}: no place in it is seen in {before}")
     write_site_map(out, merged)
     made = merged_map(str(out), merged)
     if as_json:
         return json.dumps({"joins": [asdict(each) for each in joins], **asdict(made)}, indent=2)
     return "\n".join([*map(_join_in_words, joins), *map(_flight_in_words, made.flights), str(out)])
+
+
+def _joined(path: Path, merged: SiteMap, other: SiteMap, both: SiteMap, apart: Similarity) -> Join:
+    n = len(merged.keyframes)
+    n_shared = len(shared_points(both.keyframes[:n], both.keyframes[n:]))
+    moved = _moved(merged, other, both, apart)
+    return Join(str(path), n_shared, n_shared < MIN_SHARED, moved)
 
 
 def _join_in_words(join: Join) -> str:

@@ -14,7 +14,7 @@ from companion.errors import InputError
 from companion.estimation.site.site_use import world_from_site
 from companion.products.report.batch_page import MergedFlight, MergedMap
 from companion.products.site_map_file import SITE_MAP, read_site_map, write_site_map
-from companion.slam.map.site_flights import SiteFlight, disagreement_m
+from companion.slam.map.site_flights import SiteFlight, disagreement_m, pixel_m
 from companion.slam.map.site_map import SiteMap
 from companion.slam.mapping.site_merge import merge_sites
 
@@ -46,7 +46,8 @@ def merge_flights(names: Sequence[str], out: Path, run: MergePairs) -> list[Merg
     """Merge the site maps of flights, folders of `out`, as far as they see the same places.
 
     The largest becomes site.map of `out`, others site-2.map and so on; flights without a map, which
-    has a scale, are left out. A map that is merged lies in the world of its first flight.
+    has a scale, are left out. A map that is merged lies in the world of its coarsest flight: pairs
+    are joined from the coarsest to the finest, as `merge_sites` wants it.
     """
     for old in [*out.glob(SITE_MAP), *out.glob(OTHERS.format("[0-9]*"))]:
         old.unlink()
@@ -55,6 +56,7 @@ def merge_flights(names: Sequence[str], out: Path, run: MergePairs) -> list[Merg
     work.mkdir()
     try:
         islands = [path for name in names if (path := out / name / SITE_MAP).is_file()]
+        islands.sort(key=lambda path: -pixel_m(read_site_map(path).site))
         apart: dict[tuple[Path, Path], str] = {}
         n_made = 0
         while pairs := _disjoint(islands, apart):

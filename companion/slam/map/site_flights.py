@@ -35,6 +35,16 @@ class SiteFlight:
         return np.stack([k.centre for k in self.keyframes])
 
 
+def pixel_m(site: SiteMap) -> float:
+    """Size of a pixel on the points of a site map, metres, median of all observations."""
+    sizes = []
+    for keyframe, part in zip(site.keyframes, site.part_of.tolist(), strict=True):
+        seen = site.points.positions[keyframe.point_ids[keyframe.point_ids >= 0]]
+        away_m = np.linalg.norm(seen - keyframe.centre, axis=1)
+        sizes.append(away_m / site.parts[part].camera.focal_px)
+    return float(np.median(np.concatenate(sizes)))
+
+
 def disagreement_m(site: SiteMap, a: SiteFlight, b: SiteFlight) -> tuple[float | None, int]:
     """Standard deviation, of one axis, by which two flights disagree, and on how many points.
 

@@ -38,7 +38,9 @@ def merge_sites(first: SiteMap, other: SiteMap, other_in_first: Similarity) -> S
     """One map of two, in the world of the first; None where no place of one is seen in the other.
 
     `other_in_first` takes the second's world to the first's, as their origins have it. Both maps
-    are adjusted as one, which then is placed as the two were, each weighted by its variance.
+    are adjusted as one, which then is placed as the two were, each weighted by its variance. The
+    first yields: points of both are moved to the corners of the other, and it is bent towards the
+    other before all are adjusted. So the other should be the finer one (`pixel_m`).
     InputError where they are bound by one place alone, and that places the other's far end worse
     than the place of both is stated.
     """
