@@ -14,6 +14,8 @@ from companion.config.setting_keys import dump, with_values
 HIDDEN = "***"
 """Text in place of a password."""
 _PASSWORD = re.compile(r"(://[^:/@\s]*):[^/\s]+@")
+_PASSWORD_MISTYPED = re.compile(r"""\b(\w+:/?[^:/@\s"',]+):[^:/@\s"',]+@""")
+"""With a slash or both left out, as in a configuration that does not work yet."""
 _PASSWORD_GIVEN = re.compile(
     r"""\b(user-pw|proxy-pw|password|passwd|pwd|pass|passphrase|\w*token|\w*secret)="""
     r"""("[^"]*"|'[^']*'|[^\s&"'!]+)""",
@@ -38,7 +40,9 @@ def _hidden(value: Any) -> Any:
 
 def without_passwords(text: str) -> str:
     """A text, with the passwords of URLs and pipelines in it made unreadable."""
-    return _PASSWORD_GIVEN.sub(rf"\1={HIDDEN}", _PASSWORD.sub(rf"\1:{HIDDEN}@", text))
+    for url in (_PASSWORD, _PASSWORD_MISTYPED):
+        text = url.sub(rf"\1:{HIDDEN}@", text)
+    return _PASSWORD_GIVEN.sub(rf"\1={HIDDEN}", text)
 
 
 def command_shown(argv: Sequence[str]) -> str:

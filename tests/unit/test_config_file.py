@@ -291,6 +291,8 @@ def test_passwords_are_not_shown() -> None:
 
 @pytest.mark.parametrize("text", [
     "rtsp://eye:s3@cret@10.0.0.2/main",
+    "rtsp:/eye:s3cret@10.0.0.2/main",
+    'url = "rtsp:eye:s3cret@10.0.0.2/main"',
     "rtspsrc location=rtsp://10.0.0.2/ user-id=eye user-pw=s3cret ! rtph264depay",
     'rtspsrc user-pw="s3 cret" ! decodebin',
     "http://10.0.0.2/live?user=eye&password=s3cret&channel=1",
@@ -301,6 +303,11 @@ def test_nor_are_those_of_pipelines_and_queries(text: str) -> None:
     seen = without_passwords(text)
     assert "cret" not in seen and "***" in seen
     assert "10.0.0.2" in seen or "10.0.0.2" not in text
+
+
+def test_what_only_looks_alike_is_shown() -> None:
+    text = '{"a": "12:30:45", "b":"c","d:e":"pilot@10.0.0.2"} at 12:30:45 pilot@10.0.0.2'
+    assert without_passwords(text) == text
 
 
 def test_a_file_without_passwords_is_read_back(tmp_path: Path) -> None:
