@@ -7,7 +7,6 @@ the daemon's user and its group, may read them with `companion page`.
 from __future__ import annotations
 
 import json
-import os
 import secrets
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -57,10 +56,9 @@ def read_codes(flights: Path) -> Codes | None:
 def write_codes(flights: Path, codes: Codes) -> None:
     """Keep codes, readable for the owner and the group only; OSError."""
     flights.mkdir(parents=True, exist_ok=True)
-    path = flights / FILE
-    path.unlink(missing_ok=True)
-    os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, MODE))
-    write_atomically(path, json.dumps(asdict(codes)).encode() + b"\n", durable=True, like=path)
+    path, data = flights / FILE, json.dumps(asdict(codes)).encode() + b"\n"
+    # drawn by root, they are still the daemon's to read
+    write_atomically(path, data, durable=True, like=path if path.exists() else None, mode=MODE)
 
 
 def plain(code: str) -> str:

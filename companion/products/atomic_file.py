@@ -24,8 +24,10 @@ def write_atomically(
         part.unlink(missing_ok=True)  # one left by a crash has the mode that it was created with
         with open(part, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             if like is not None:
-                theirs = like.stat()
-                os.fchown(file.fileno(), theirs.st_uid, theirs.st_gid)
+                theirs, own = like.stat(), os.fstat(file.fileno())
+                # not for nothing: a service may be forbidden the call
+                if (own.st_uid, own.st_gid) != (theirs.st_uid, theirs.st_gid):
+                    os.fchown(file.fileno(), theirs.st_uid, theirs.st_gid)
                 os.fchmod(file.fileno(), stat.S_IMODE(theirs.st_mode))
             for some in [data] if isinstance(data, bytes) else data:
                 file.write(some)

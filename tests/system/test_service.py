@@ -125,6 +125,7 @@ def test_it_boots_into_the_running_service(container: Container, service: Booted
         "journalctl", "--unit=companion", "--no-pager", "--grep=has died|linker", check=False
     )
     assert "died" not in died, died
+    assert "look on" in container.run("companion", "page"), "the codes of the page"
 
 
 def test_killed_it_comes_back(container: Container, service: BootedService) -> None:

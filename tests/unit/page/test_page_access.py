@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from companion.page.codes import new_codes, write_codes
+from companion.page.codes import new_codes, read_codes, write_codes
 from tests.support.served_page import ELSEWHERE, HERE, ServedPage
 
 VIEWS = ("/", "/map", "/flights", "/setup", "/settings", "/now/panel", "/setup/steps")
@@ -143,6 +145,20 @@ def test_new_codes_end_all_sessions(served: ServedPage) -> None:
     write_codes(served.flights, new_codes())
     assert served.ask("GET", "/", peer=ELSEWHERE, headers=headers).status == 303
     assert served.paired(served.codes.look)
+
+
+def test_codes_are_kept_by_a_service_that_may_change_no_owner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As systemd confines it: SystemCallFilter=~@privileged."""
+
+    def refused(*_: int) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "fchown", refused)
+    for codes in (new_codes(), new_codes()):
+        write_codes(tmp_path, codes)
+        assert read_codes(tmp_path) == codes
 
 
 def test_codes_are_kept_for_owner_and_group_alone(served: ServedPage) -> None:
