@@ -21,17 +21,12 @@ from companion.streaming.viewer.colours import Colours
 from companion.streaming.viewer.drawing import Drawing
 
 
-def _end(stop: threading.Event) -> None:
-    signal.sigwait({signal.SIGTERM})
-    stop.set()
-
-
 def main() -> None:
     address, out, rrd = sys.argv[1:4]
     stop = threading.Event()
-    # by a thread: a handler would wait for the event's lock, which this thread may hold
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
-    threading.Thread(target=_end, args=(stop,), daemon=True).start()
+    # by a thread: a handler would wait for the event's lock, which this thread may hold. And not by
+    # sigwait: threads that libraries began when they were imported do not block the signal
+    signal.signal(signal.SIGTERM, lambda *_: threading.Thread(target=stop.set).start())
     recording = rr.RecordingStream("links")
     recording.save(rrd)
     drawing = Drawing(recording, live=True, colours=Colours.PICTURE)
