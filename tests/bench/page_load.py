@@ -1,6 +1,6 @@
 """Effect of the page on the pose: 20 browsers that look on, hung peers, and rubbish.
 
-    python -m tests.bench.page_load [--rounds 5] [--seconds 20]
+    python -m tests.bench.page_load [--rounds 5] [--seconds 20] [--real-time]
 
 Flies the camera and the autopilot of the tests in real time. In turns nobody looks at the page, and
 everything at once does: 20 clients that ask as an open view does, 20 that ask nothing or read
@@ -8,7 +8,8 @@ nothing, and rubbish at 10 MB/s as far as it is taken. Who asks is a process of 
 as on a drone it is other machines: beside the camera and the autopilot of the tests it would make
 them late too. Of each turn it prints the rate of poses that reached the autopilot, the 95th
 percentile from exposure to pose, the memory (PSS) of all processes, and the processor time of the
-page; at the end whether what it is with them lies within the spread without.
+page; at the end whether what it is with them lies within the spread without. `--real-time`, for
+root, gives the pose the priority that it has in `companion.service` by LimitRTPRIO=1.
 """
 
 from __future__ import annotations
@@ -139,6 +140,12 @@ class Turn(NamedTuple):
     """Share of a core."""
 
 
+def give_real_time(daemon: psutil.Process) -> None:
+    """Real-time priority for the thread from frame to pose, which the service lets it take."""
+    pose = next(each for each in daemon.children(recursive=True) if each.name() == "localisation")
+    os.sched_setscheduler(pose.pid, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+
+
 def measured(paged: Paged, seconds: float, loaded: bool) -> Turn:
     """One turn."""
     daemon = psutil.Process(paged.daemon.pid)
@@ -167,6 +174,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--dense", action="store_true", help="with the dense map")
+    parser.add_argument("--real-time", action="store_true", help="for the pose, as in the service")
     parser.add_argument("--ask", type=int, metavar="PORT", help="be who asks, for this bench")
     given = parser.parse_args()
     if given.ask:
@@ -177,6 +185,8 @@ def main() -> None:
         paged.until_served()
         paged.autopilot.arm()
         paged.daemon.until(lambda health: health["feedback"]["sending"], "poses", timeout_s=FLY_S)
+        if given.real_time:
+            give_real_time(psutil.Process(paged.daemon.pid))
         for number in range(given.rounds):
             for loaded in (False, True):
                 turn = measured(paged, given.seconds, loaded)
