@@ -118,6 +118,8 @@ STAGES = (
             Frame, PositionSample, *PLOTTED, Warned, Health, GeoOrigin, Odometry, Track,
             KeyframeAdded, MapUpdate, DepthMap, PointChunk, ObstaclesSeen,
         ),
+        # not class idle, as the dense map: on a full core poses would come half a minute late,
+        # and be taken for those of now
         nice=10, frames=Frames.EVERY, answer_s=30.0, finish_s=6.0, with_flight=True,
         frame_every_ns=60_000_000,
     ),
