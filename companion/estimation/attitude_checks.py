@@ -29,7 +29,7 @@ class AttitudeChecks:
 
     def check(self, t_ns: int) -> list[Warned]:
         """Check the active map, by the attitude where that is due."""
-        stands_ns = self._odometry.stands_since_ns
+        stands_ns = self._odometry.standing_picture.since_ns
         if stands_ns is not None and t_ns - stands_ns > MAX_STANDS_NS:
             self._leave_map(1, True, 0.0)
             return [Warned(t_ns, SIGHT_STANDS, "by the accelerometers; is the lens covered?")]

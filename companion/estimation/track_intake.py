@@ -34,7 +34,7 @@ class TrackIntake:
         """Outputs of a track, `is_now` if it is that of the frame; `predicted` was its pose."""
         if is_now:
             self.seen = None
-        if self._smooth.stands_since_ns is not None:
+        if self._smooth.standing_picture.since_ns is not None:
             yield self._odometry.of_track(track)
             yield Track(track.seq, track.t_ns, TrackState.LOST)
         elif track.map_from_camera is not None:

@@ -30,6 +30,7 @@ from companion.estimation.odometry.odometry_frame import (
     drift_m,
 )
 from companion.estimation.odometry.stand import Stand
+from companion.estimation.odometry.standing_picture import StandingPicture
 from companion.estimation.odometry.tracked_velocity import tracked_velocity
 from companion.estimation.odometry.tracking_quality import FoundAgain, quality_of
 from companion.geometry.camera import Camera
@@ -42,9 +43,6 @@ QUALITY_MARGIN = 1.5
 vehicle that turns on the spot sees new ground without parallax."""
 SIGMA_DOUBTED_M, SIGMA_DOUBTED_M_S = 0.1, 0.1
 """At least, of inertial navigation that a wrong map has aided."""
-LEAST_GONE_M, STANDS_RATIO = 0.25, 0.3
-"""Way by inertial navigation since the map agreed with it, and of that what the map has of it at
-most where it stands."""
 NOISE_INFLATION = 3.0
 """Inflation for correlated errors of the matches of one image: those of the points they share."""
 
@@ -75,10 +73,7 @@ class SmoothOdometry:
         self.found_again = FoundAgain()
         self._aided_by: int | None = None
         """The map that aided inertial navigation last."""
-        self._agreed_m: Array = np.zeros(3)
-        """Place (3,) at which the map and inertial navigation agreed last."""
-        self.stands_since_ns: int | None = None
-        """Time since which the map stands and accelerometers say that it moves; else None."""
+        self.standing_picture = StandingPicture()
 
     def begin(
         self, t_ns: int, attitude: BodyAttitude | None, standing: bool = False,
@@ -180,7 +175,9 @@ class SmoothOdometry:
         image_m = track.sigma_position * georeference.world_from_map.scale
         noise_m = NOISE_INFLATION * image_m
         here = flown.frame.from_world @ raw  # also where dead reckoning was off
-        if self._stands(track.t_ns, here):
+        if self.standing_picture.stands(
+            track.t_ns, here.translation, self.reckoning.reckoned, course.body.refuses
+        ):
             self._aid(track.t_ns, here, georeference, noise_m)
             return course.none(Track(track.seq, track.t_ns, TrackState.LOST))
         seen_again = course.dead_reckoning
@@ -271,22 +268,6 @@ class SmoothOdometry:
             self._aided_by, self._course.aided_sigma_scale = segment, sigma_scale
             self.ground.map_aided(t_ns)
 
-    def _stands(self, t_ns: int, placed: Pose) -> bool:
-        """True where a tracked pose of the body stands, and accelerometers say that it has gone on.
-
-        A pattern that stands in the picture, dirt or the sensor's own, is tracked as well as ground
-        is.
-        """
-        reckoned, place_m = self.reckoning.reckoned, placed.translation
-        if not self._course.body.refuses:
-            self._agreed_m, self.stands_since_ns = place_m, None
-        elif self.stands_since_ns is None and reckoned is not None:
-            seen_m = float(np.linalg.norm(place_m - self._agreed_m))
-            gone_m = float(np.linalg.norm(reckoned.place_m - self._agreed_m))
-            if gone_m > LEAST_GONE_M and seen_m < STANDS_RATIO * gone_m:
-                self.stands_since_ns = t_ns
-        return self.stands_since_ns is not None
-
     def place_in_map(self, place_m: Array, map_from_camera: Array) -> Array | None:
         """Place of the camera (3,) in the active map; see `FlownMap.place_of_camera`."""
         return self._course.flown.place_of_camera(place_m, map_from_camera)
@@ -316,7 +297,7 @@ class SmoothOdometry:
         velocity.
         """
         flown, velocity = self._course.flown, self._course.velocity
-        self.stands_since_ns = None
+        self.standing_picture.since_ns = None
         if flown.placed is None or segment != flown.placed.segment or flown.last is None:
             return
         share, way_m = float(np.sin(min(tilt_rad, np.pi / 2))), flown.way_m()
