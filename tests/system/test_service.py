@@ -148,17 +148,19 @@ def test_what_was_cut_short_is_repaired_unless_armed(
     service.until_flying()
     names = recordings(container)[:-1]
     assert "cut short" in verified(container, names[-1])
-    container.run("systemctl", "stop", "autopilot")
-    service.systemctl("restart", "companion")
 
     def all_well() -> bool:
         return not any("cut short" in verified(container, name) for name in names)
 
-    until(all_well, "no recording that is cut short")
+    container.run("systemctl", "stop", "autopilot")
+    try:
+        service.systemctl("restart", "companion")
+        until(all_well, "no recording that is cut short")
+    finally:  # all tests after this one fly as well
+        container.run("systemctl", "start", "autopilot")
     assert_readable(container, names)
     said = service.run("journalctl", "--unit=companion", "--no-pager", "--lines=200")
     assert "an earlier recording was cut short: " in said and ": repaired, " in said
-    container.run("systemctl", "start", "autopilot")
     service.until_flying()
 
 
