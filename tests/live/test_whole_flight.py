@@ -262,5 +262,6 @@ def test_only_one_daemon(flown: Flown) -> None:
 
 def test_it_ends_when_told(flown: Flown) -> None:
     assert flown.stop_s < flown.stop_allowed_s
-    assert flown.lines[-1] == "companion: stopped"
+    # a flight whose results took all the time that there is may say so at the same time
+    assert "companion: stopped" in flown.lines[-2:]
     assert not [line for line in flown.lines if "Traceback" in line]
