@@ -109,8 +109,12 @@ $(VENV)/.installed: pyproject.toml | $(BIN)/python
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 
+# evo: errors of paths by somebody else's arithmetic (GPL-3: for tests only). Its arithmetic needs
+# NumPy and SciPy; its plots want pandas, which pyarrow, where it is installed, imports in each process
+# that feeds a viewer: 0.7 s of a processor each, which no installed program takes.
 $(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps 'evo>=1.30'
 	touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
