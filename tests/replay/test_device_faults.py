@@ -11,7 +11,7 @@ from tests.support.processes.program import Run, replay
 from tests.support.reference.failing_driver import fail, two_devices
 
 FLIGHT = Path(__file__).parents[2] / "sample" / "survey"
-SHORT = "--stop", "6", "--set", "expert.depth.stride=4"
+SHORT = "--stop", "6", "--set", "expert.depth.stride=8"
 KERNELS = 900
 """The test at the start runs some hundred, each depth map some ten: it fails in mid-flight."""
 
