@@ -17,7 +17,8 @@ from drivers.system.low_priority import processor_time_s
 from tests.support.served_page import ELSEWHERE, Answer, ServedPage
 
 NAME = "00001-2026-11-19T10-00-00Z"
-PATIENCE_S = 60.0
+PATIENCE_S = 140.0
+"""Such work gets what nobody else wants: beside other tests hardly anything."""
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ from companion.runtime.stage_protocol import (
 )
 from companion.runtime.stage_start import start_alone
 from companion.runtime.stages import stage_named
+from companion.telemetry import AttitudeSample
 from tests.support.flights.flown import facts
 from tests.support.reference.scoring import read_ply
 
@@ -50,12 +51,13 @@ def test_a_snapshot_and_another(tmp_path: Path, rng: np.random.Generator) -> Non
             colours = np.zeros((N_POINTS, 3), np.uint8)
             chunk = PointChunk(n, n, points, colours, ones, 0 * points, ones)
             stage.offer(Parcel.of(chunk))
+        still = AttitudeSample(1, np.array([1.0, 0, 0, 0]))  # nothing is drawn anew for it
         for number in (1, 2):
             stage.order(TakeSnapshot(number))
             last = Snapshot(number)
             percents = []
             while not last.path:
-                stage.offer(Parcel.of(update))  # the flight goes on: it is between its messages
+                stage.offer(Parcel.of(still))  # the flight goes on: it is between its messages
                 try:
                     last = told.get(timeout=0.02)
                 except queue.Empty:
