@@ -162,7 +162,9 @@ class ImuVerdict:
     def _found(self, window: ImuWindow) -> tuple[_Fault | None, Agreement | None]:
         """A fault, and the comparison with the attitude."""
         if window.attitude_s[-1] - window.imu_s[-1] > MAX_SILENT_S:
-            return _Fault(SILENT, "it is silent", needed=1), None
+            alone_s = window.attitude_s[-1] - max(window.imu_s[-1], _heard_since_s(window))
+            is_silent = alone_s > MAX_SILENT_S
+            return _Fault(SILENT, "it is silent", needed=1) if is_silent else None, None
         own = fault(window)
         if own is not None:
             return _Fault(own.split(":")[0], own), None
@@ -201,6 +203,12 @@ class ImuVerdict:
             self._ways |= compared.chi_square.min(axis=1) > best + SURE
             self._in_time |= bool(compared.chi_square[IDENTITY, ~in_time].min() > best + SURE)
         self.confirmed = self._in_time and bool(self._ways[1:].all())
+
+
+def _heard_since_s(window: ImuWindow) -> float:
+    """Since when attitudes have come without a pause: a cut link silences all that it carries."""
+    pauses = np.flatnonzero(np.diff(window.attitude_s) > MAX_SILENT_S)
+    return float(window.attitude_s[pauses[-1] + 1] if len(pauses) else window.attitude_s[0])
 
 
 def _turned_or_late(compared: Agreement) -> _Fault | None:

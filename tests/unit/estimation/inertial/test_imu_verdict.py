@@ -287,6 +287,30 @@ def test_one_that_falls_silent_is_used_again_when_it_is_back() -> None:
     assert verdict.believed
 
 
+@pytest.mark.parametrize("seconds", [2.0, 5.0])
+@pytest.mark.parametrize("motion", [hovering, weaving])
+def test_a_link_that_is_cut_is_not_the_imu(motion: Motion, seconds: float) -> None:
+    """Used again at once: dead reckoning is wanted most where links fail."""
+
+    def heard(each: Sample) -> bool:
+        return not 12.0 < each.t_ns * 1e-9 < 12.0 + seconds
+
+    given = samples(motion, seconds=22.0 + seconds)
+    verdict, changes, _ = judged(each for each in given if heard(each))
+    assert (changes, verdict.believed) == ([], True)
+
+
+def test_one_that_stays_away_after_a_cut_is_said() -> None:
+    def heard(each: Sample) -> bool:
+        t_s = each.t_ns * 1e-9
+        return t_s < 8.0 if isinstance(each, ImuSample) else not 8.0 < t_s < 11.0
+
+    given = samples(weaving, seconds=16.0)
+    verdict, (silent,), _ = judged(each for each in given if heard(each))
+    assert silent.warning.detail == verdict.fault == "it is silent"
+    assert 12.0 <= silent.warning.t_ns * 1e-9 <= 13.5
+
+
 def test_axes_that_are_right_again_must_show_it() -> None:
     def wrong(each: ImuSample) -> ImuSample | None:
         return about(2)(each) if each.t_ns < 6_000_000_000 else each
