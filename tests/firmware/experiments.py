@@ -17,7 +17,7 @@ from tests.firmware.trial import Conditions, Trial
 from tests.firmware.way_back import WAY_BACK, way_back
 
 Flown = Callable[[Trial, Figures], None]
-HOLD_S, READY_S, PATIENT_S, SWING_S = 60.0, 30.0, 45.0, 40.0
+HOLD_S, READY_S, PATIENT_S, SWING_S, TOLD_S = 60.0, 30.0, 45.0, 40.0, 5.0
 USUAL = "position on", "dead reckoning", "autopilot connected", "camera recovered"
 """Texts of a flight in which nothing is wrong."""
 SIXTY_POSES = "expert.feedback.rate_hz=60"
@@ -63,6 +63,20 @@ def tour(trial: Trial, figures: Figures) -> None:
     manoeuvres.climb(trial, figures)
     manoeuvres.turn(trial, figures)
     trial.pilot.go_to(np.array([*home[:2], trial.ground.believed_m[2]]), yaw_rad)
+    time.sleep(manoeuvres.SETTLE_S)
+    manoeuvres.land(trial, figures, stood)
+
+
+def full_turn(trial: Trial, figures: Figures) -> None:
+    """No GPS from power-on; once about on the spot over ground seen for a few seconds, landing."""
+    stood = trial.ground.place_m
+    if not manoeuvres.up(trial, figures):
+        return
+    time.sleep(manoeuvres.SETTLE_S)
+    manoeuvres.ready_to_go(trial)
+    home, yaw_rad = trial.ground.believed_m, manoeuvres.believed_yaw(trial)
+    manoeuvres.turn(trial, figures)
+    trial.pilot.go_to(home, yaw_rad)
     time.sleep(manoeuvres.SETTLE_S)
     manoeuvres.land(trial, figures, stood)
 
@@ -168,6 +182,9 @@ def wrong_set_up(trial: Trial, figures: Figures) -> None:
     trial.start_daemon()
     sending = trial.until("poses", lambda: trial.sending, PATIENT_S)
     figures.add("first pose after both are up", sending, "s", note=str(trial.feedback))
+    told = trial.until("told before arming", lambda: _warnings(trial, began_s), TOLD_S)
+    said = " / ".join(_warnings(trial, began_s))
+    figures.add_true("the pilot is told before arming", told is not None, said)
     armed = sending is not None and manoeuvres.armed_in(trial, trial.pilot.modes_to_arm_in[-1])
     if armed:
         trial.pilot.take_off(manoeuvres.TAKE_OFF_M)
@@ -176,9 +193,14 @@ def wrong_set_up(trial: Trial, figures: Figures) -> None:
         figures.add("level way until 10 s after take-off", level_m.max(), "m", 1.0)
         trial.mark(f"sending {trial.sending}, {trial.ground.mode}")
         trial.pilot.land()
-    texts = list(dict.fromkeys(t for t in trial.ground.texts_since(began_s) if "Companion" in t))
-    said = [text for text in texts if not any(good in text for good in USUAL)]
-    figures.add_true("the pilot is told", bool(said), " / ".join(said))
+    texts = _warnings(trial, began_s)
+    figures.add_true("the pilot is told", bool(texts), " / ".join(texts))
+
+
+def _warnings(trial: Trial, since_s: float) -> list[str]:
+    """What the pilot has read from the companion since then, but for what is usual."""
+    texts = dict.fromkeys(t for t in trial.ground.texts_since(since_s) if "Companion" in t)
+    return [text for text in texts if not any(good in text for good in USUAL)]
 
 
 def wrong_lens(trial: Trial, figures: Figures) -> None:
@@ -186,6 +208,7 @@ def wrong_lens(trial: Trial, figures: Figures) -> None:
     stood, began_s = trial.ground.place_m, time.time()
     if not manoeuvres.up(trial, figures):
         return
+    figures.add_true("unproven lens told before arming", trial.said("unproven", began_s))
     said = trial.until("focal length", lambda: trial.said("focal length", began_s), 1.0)
     figures.add_true("nothing is said before it turns", said is None)
     turned_s = time.time()
@@ -228,6 +251,7 @@ EXPERIMENTS: dict[str, tuple[Flown, Conditions]] = {
     "square": (square, Conditions()),
     "square_avoiding": (square, replace(BEFORE_A_WALL, landmarks="")),
     "tour": (tour, Conditions()),
+    "full_turn": (full_turn, Conditions()),
     "wander": (wander, Conditions()),
     "faults": (faults, Conditions()),
     "second_flight": (second_flight, Conditions()),
