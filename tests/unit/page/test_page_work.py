@@ -34,10 +34,10 @@ def post(served: ServedPage, path: str, **form: str) -> Answer:
     return served.ask("POST", path, headers=headers, peer=ELSEWHERE, form={"token": token, **form})
 
 
-def until(served: ServedPage, path: str, words: str) -> str:
-    """The fragment, once it says something."""
+def until(served: ServedPage, path: str, words: str, said: bool = True) -> str:
+    """The fragment, once it says something, or says it no more."""
     end_s = time.monotonic() + PATIENCE_S
-    while words not in (text := served.ask("GET", path, headers={"host": "localhost"}).text):
+    while (words in (text := served.ask("GET", path, headers={"host": "localhost"}).text)) != said:
         assert time.monotonic() < end_s, text
         served.now_s += 1.0  # the page allows a peer some questions a second
         time.sleep(0.05)
@@ -58,7 +58,7 @@ def test_a_work_that_fails_says_why(served: ServedPage, begin: str, panel: str, 
     assert not list((served.flights / NAME).glob("replay-*"))
 
 
-def test_a_replay_tells_how_much_processor_time_it_gets(
+def test_a_replay_tells_how_much_processor_time_it_gets_until_it_is_stopped(
     served: ServedPage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(background_work, "LOOK_EVERY_S", 0.01)
@@ -66,7 +66,11 @@ def test_a_replay_tells_how_much_processor_time_it_gets(
     assert told > 0 and processor_time_s(0) == 0
     assert post(served, f"/flights/{NAME}/replay").status == 303
     until(served, f"/flights/{NAME}/replay/panel", " s of processor time in ")
-    until(served, f"/flights/{NAME}/replay/panel", "not an MCAP file")
+    until(served, "/flights/another/replay/panel", "Another work of the page runs")
+    assert post(served, f"/flights/{NAME}/replay/stop").status == 303
+    until(served, "/flights/another/replay/panel", "Another work of the page runs", said=False)
+    panel = until(served, f"/flights/{NAME}/replay/panel", "Replay it")
+    assert "Not replayed" not in panel and "Replayed." not in panel
 
 
 def test_nothing_heavy_is_begun_while_armed_or_without_the_right(served: ServedPage) -> None:
