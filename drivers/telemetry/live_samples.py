@@ -114,7 +114,8 @@ class LiveSamples:
             self._unix_minus_boot_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
         remote_ns = boot_ns(message, self._unix_minus_boot_ns)
         if remote_ns is None:
-            self.n_dropped["telemetry without boot time"] += 1
+            if samples_of(message, self.less_biases):  # without a receiver GPS has neither
+                self.n_dropped["telemetry without boot time"] += 1
             return
         if self._stamps.get(kind) == remote_ns:
             return  # sent again because nothing newer was measured
