@@ -233,7 +233,7 @@ class PoseGate:
         if "attitude" not in self._use:
             return NOT_BELIEVED
         may_bridge = self.sending or self._proof.paused_lately(now_ns)
-        before = Before(self.sending, self._accepted is not None, may_bridge)
+        before = Before(self.sending, may_bridge)
         attitude = self._attitude.at(odometry.t_ns)
         return rejection_reason(odometry, now_ns, attitude, before, self._config)
 

@@ -39,13 +39,12 @@ NO_MOUNT = "camera mount is not known"
 
 @dataclass(frozen=True, slots=True)
 class Before:
-    """State before a pose: whether poses are sent, and whether one was ever accepted.
+    """State before a pose: whether poses are sent.
 
     With `may_bridge` inertial dead reckoning may stand for tracking.
     """
 
     sending: bool
-    accepted: bool
     may_bridge: bool
 
 
@@ -66,7 +65,7 @@ def rejection_reason(
     if pose is None and odometry.state is TrackState.STANDING:
         return UNPROVED_IMU
     if pose is None or velocity is None:
-        return LOST if before.accepted else NO_SCALE
+        return NO_SCALE if odometry.state is TrackState.TRACKING else LOST
     parts = pose.rotation, pose.translation, velocity
     if (
         not all(np.isfinite(part).all() for part in parts)

@@ -25,7 +25,7 @@ from companion.geometry.transforms import (
     vector_from_rotation,
     yaw_rotation,
 )
-from companion.messages import Odometry, Warned
+from companion.messages import Odometry, TrackState, Warned
 from companion.telemetry import AttitudeSample, GimbalSample, PositionSample
 
 MAX_RATE_SPAN_NS = 300_000_000
@@ -128,14 +128,14 @@ class GimbalHead:
     def body_of(self, odometry: Odometry, ned_from_head: Array | None) -> Odometry:
         """Odometry of the body by that of the head, with the head's attitude (3, 3) of its time.
 
-        Without a pose where that, or the autopilot's, is not known.
+        Lost, without a pose, where that, or the autopilot's, is not known.
         """
         head, t_ns = odometry.world_from_body, odometry.t_ns
         if head is None:
             return odometry
         vehicle = self._vehicle.at(t_ns)
         if ned_from_head is None or vehicle is None:
-            return Odometry(odometry.seq, t_ns, odometry.state, odometry.reset_counter)
+            return Odometry(odometry.seq, t_ns, TrackState.LOST, odometry.reset_counter)
         rotation = head.rotation @ ned_from_head.T @ vehicle
         lever_m = rotation @ self._place_body_m
         velocity = odometry.velocity_world_m_s

@@ -599,6 +599,13 @@ def test_dead_reckoning_by_a_held_velocity_is_not_sent() -> None:
     assert (flight.gate.state, flight.gate.why_not) == (Sending.OFF, "lost")
 
 
+def test_a_map_begun_anew_is_without_scale_not_lost() -> None:
+    flight = Flight()
+    flight.run(2)
+    assert not [p for p in flight.run(2, world_from_body=None) if not p.predicted]
+    assert (flight.gate.state, flight.gate.why_not) == (Sending.OFF, "no metric scale")
+
+
 def test_a_bridge_is_level_by_the_autopilot_too() -> None:
     flight = Flight()
     flight.run(2)

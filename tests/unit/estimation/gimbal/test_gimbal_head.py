@@ -100,6 +100,7 @@ def test_there_is_no_pose_of_the_body_without_either(has_head: bool, has_body: b
     found = head.body_of(given, np.eye(3) if has_head else None)
     assert found.world_from_body is None and found.velocity_world_m_s is None
     assert found.quality == -1 and found.sigma_position_m == np.inf
+    assert found.state is TrackState.LOST
     assert (found.seq, found.t_ns, found.reset_counter) == (1, 10 * MS, 3)
 
 
