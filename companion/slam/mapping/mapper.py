@@ -30,6 +30,12 @@ from companion.slam.mapping.map_adjustment import (
 from companion.slam.mapping.mapping_worker import MapLock
 from companion.slam.mapping.pass_fusion import fuse_passes
 from companion.slam.mapping.point_fusion import N_NEIGHBOURS, PointFusion
+from companion.slam.mapping.turned_view import (
+    MIN_SEEN,
+    is_turn,
+    median_parallax_deg,
+    on_level_ground,
+)
 from companion.slam.optimisation.bundle_adjustment import adjust
 
 MIN_PARALLAX_RAD = np.radians(0.8)
@@ -78,7 +84,9 @@ class Mapper:
         ][:N_NEIGHBOURS]
         slam_map.update_geometry(points, [*reversed(neighbours), keyframe])
         assert keyframe.grey is not None
-        created = self._triangulate(keyframe, neighbours, image_levels(keyframe.grey))
+        levels = image_levels(keyframe.grey)
+        created = self._triangulate(keyframe, neighbours, levels)
+        self._place_on_ground(keyframe, neighbours, levels)
         self.fusion.extend(keyframe, neighbours, created)
         self.fusion.fuse_held(keyframe)
         self._refine([keyframe, *neighbours])
@@ -157,6 +165,32 @@ class Mapper:
             slam_map.update_geometry(ids, [other, keyframe])
             created.append(ids)
         return np.concatenate(created) if created else np.zeros(0, np.int64)
+
+    def _place_on_ground(
+        self, keyframe: Keyframe, neighbours: list[Keyframe], levels: list[Bytes]
+    ) -> None:
+        """Place points on ground that a turn has brought into view, where that shows few others."""
+        slam_map, pose, attitude = self._map, keyframe.camera_from_map, keyframe.ned_from_camera
+        _, seen = slam_map.observations_of(keyframe)
+        if attitude is None or not neighbours or len(seen) >= MIN_SEEN * len(keyframe.point_ids):
+            return
+        before = max(neighbours, key=lambda each: each.keyframe_id).camera_from_map
+        if not is_turn(median_parallax_deg(slam_map.positions[seen], pose, before), pose, before):
+            return
+        known = [slam_map.observations_of(each)[1] for each in (keyframe, *neighbours)]
+        free = np.flatnonzero(keyframe.point_ids < 0)
+        chosen, points = on_level_ground(
+            pose.apply(slam_map.positions[np.unique(np.concatenate(known))]), attitude[2],
+            keyframe.features.normalised[free],
+        )  # fmt: skip
+        if len(chosen) == 0:
+            return
+        features = free[chosen]
+        ids = slam_map.add_points(
+            pose.inverse().apply(points), keyframe.keyframe_id, keyframe.features, features, levels
+        )
+        slam_map.add_observations(keyframe, features, ids)
+        slam_map.update_geometry(ids, [keyframe])
 
     def close_loop(self, keyframe: Keyframe, other: Keyframe, seen_there: Ints) -> None:
         """Fuse points of the two sides of a closed loop, and adjust where it was closed."""

@@ -10,6 +10,7 @@ from companion.slam.features.orb_features import Ints
 from companion.slam.features.view import View
 from companion.slam.map.seen import Seen
 from companion.slam.map.sparse_map import Keyframe, SlamMap
+from companion.slam.mapping.turned_view import MIN_SEEN, is_turn, median_parallax_deg
 
 MIN_SHARE, MAX_PARALLAX_DEG, MAX_S = 0.75, 3.0, 3.0
 """A keyframe is inserted below this ratio of the reference's points (ORB-SLAM2's with depth), above
@@ -31,7 +32,19 @@ def needs_keyframe(slam_map: SlamMap, reference: Keyframe, view: View, since_ns:
     late = view.t_ns - since_ns > MAX_S * 1e9 and parallax_deg > 0.5
     weak = share < MIN_SHARE and (parallax_deg > 0.4 or share < 0.5)
     unsure = view.ned_from_camera is None and view.n_inliers < FEW_POINTS and parallax_deg > 0.4
-    return weak or unsure or parallax_deg > MAX_PARALLAX_DEG or late
+    return (
+        weak or unsure or parallax_deg > MAX_PARALLAX_DEG or late
+        or _turned_away(slam_map, reference, view, parallax_deg)
+    )  # fmt: skip
+
+
+def _turned_away(slam_map: SlamMap, reference: Keyframe, view: View, parallax_deg: float) -> bool:
+    """True where a turn on the spot leaves few points in view, and half of `reference`'s."""
+    return (
+        view.n_inliers < MIN_SEEN * len(view.features)
+        and view.n_inliers < 0.5 * len(slam_map.observations_of(reference)[1])
+        and is_turn(parallax_deg, view.camera_from_map, reference.camera_from_map)
+    )
 
 
 def equivalent_keyframe(slam_map: SlamMap, view: View) -> Keyframe | None:
@@ -63,13 +76,7 @@ def _well_observed(slam_map: SlamMap, keyframe: Keyframe) -> Ints:
 def _parallax_deg(slam_map: SlamMap, reference: Keyframe, view: View) -> float:
     """Median parallax of the points of a view between it and a keyframe."""
     position = slam_map.positions[view.point_ids[view.point_ids >= 0]]
-    pose = view.camera_from_map
-    here = (-pose.rotation.T @ pose.translation) - position
-    there = reference.centre - position
-    cosine = (here * there).sum(1) / np.maximum(
-        np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=1), 1e-12
-    )
-    return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))))
+    return median_parallax_deg(position, view.camera_from_map, reference.camera_from_map)
 
 
 def keyframe_of(view: View, keyframe_id: int) -> Keyframe:
