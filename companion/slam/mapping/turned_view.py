@@ -56,7 +56,7 @@ def on_level_ground(
         return none
     below = points_camera @ down_camera
     low, height, high = np.percentile(below, (25.0, 50.0, 75.0))
-    if not 0.0 < high - low < MAX_RELIEF * height:
+    if high - low >= MAX_RELIEF * height:  # also where it is above the camera
         return none
     rays = np.column_stack((normalised, np.ones(len(normalised))))
     falls = rays @ down_camera

@@ -48,9 +48,10 @@ def ground(n: int, relief_m: float) -> np.ndarray:
     return np.asarray(rng.uniform(-4, 4, (n, 2)) @ level + np.outer(depth_m, LEVEL_DOWN))
 
 
-def test_features_lie_on_the_level_of_the_points_known() -> None:
+@pytest.mark.parametrize("relief_m", [0.0, 0.3])
+def test_features_lie_on_the_level_of_the_points_known(relief_m: float) -> None:
     normalised = np.array([[0.3, 0.2], [-0.4, 0.1], [0.0, -3.0], [0.1, -1.4]])
-    seen, points = on_level_ground(ground(200, 0.3), LEVEL_DOWN, normalised)
+    seen, points = on_level_ground(ground(200, relief_m), LEVEL_DOWN, normalised)
     assert seen.tolist() == [0, 1]  # of the others one is above the horizon, one just below it
     np.testing.assert_allclose(points @ LEVEL_DOWN, 5.0, atol=0.1)
     np.testing.assert_allclose(points[:, :2] / points[:, 2:], normalised[:2])
