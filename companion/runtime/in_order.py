@@ -3,25 +3,24 @@
 Nothing is lost, and results do not depend on anybody's speed. Localisation works in the caller's
 thread; where frames to come are known (`looked_ahead`), their features are extracted beside. Depth,
 to which no stage above it listens, has a thread of its own, fed in order through a bounded queue
-that makes the caller wait; or a process, as others that are asked for. A depth stage that fails is
+that makes the caller wait; or a process, as others that give nothing. A depth stage that fails is
 left out from there on: trajectory, map and the cloud so far stay.
 """
 
 from __future__ import annotations
 
-import os
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from companion.errors import CompanionError
 from companion.messages import Frame, Message, Warned
-from companion.runtime.fork_server import ForkServer
 from companion.runtime.lossless_process import LosslessProcess
 from companion.runtime.parcel import Parcel, allow_descriptors
 from companion.runtime.peak_memory import peak_memory_mb
 from companion.runtime.stage_protocol import Finish, Progress, Remark, Setup
+from companion.runtime.stage_start import Start
 from companion.runtime.stage_thread import StageThread
 from companion.runtime.stage_work import Work, module_of
 from companion.runtime.stages import Stage
@@ -36,13 +35,13 @@ class InOrder:
     """The given stages; feed it messages in order of time.
 
     `watch` sees every message; one for which it gives False goes no further. `say` takes remarks of
-    the stages. Those named in `apart`, depth or what is no source, get processes where this has one
-    thread only. CompanionError where a stage cannot begin.
+    the stages. With `start` depth and whatever is no source get processes. CompanionError where a
+    stage cannot begin.
     """
 
     def __init__(
         self, stages: Iterable[Stage], setup: Setup, watch: Callable[[Message], object],
-        say: Callable[[str], None], apart: Collection[str] = (),
+        say: Callable[[str], None], start: Start | None = None,
     ) -> None:  # fmt: skip
         self._watch = watch
         self._stages = list(stages)
@@ -51,7 +50,6 @@ class InOrder:
         self._thread: StageThread | None = None
         """Thread of depth, if it has no process."""
         self._processes: dict[str, LosslessProcess] = {}
-        self._server: ForkServer | None = None
         self._closer = ThreadPoolExecutor(1, "parcels")
         self._closed: dict[int, Future[Parcel]] = {}
         """Frames to come, closed for the processes, by their number."""
@@ -60,12 +58,10 @@ class InOrder:
             if isinstance(told, Remark):
                 say(told.text)
 
-        if apart and len(os.listdir("/proc/self/task")) == 1:  # else a copy would not be whole
+        if start is not None:
             allow_descriptors()
-            self._server = ForkServer(copy=True)
             for stage in self._stages:
-                if stage.name in apart:
-                    start = self._server.start
+                if stage.name == DEPTH or not stage.is_source:
                     self._processes[stage.name] = LosslessProcess(stage, start, say)
         try:
             for process in self._processes.values():
@@ -159,22 +155,32 @@ class InOrder:
         finally:  # results so far are written, whatever has failed
             # before the final map comes: what it is measured by is that of its own time
             if self._depth is not None:
-                self._depth.close(Finish(hurry=False))
+                self._depth.ask_to_finish(Finish(hurry=False))
+                self._depth.close()
                 self.collect()
             self._publish(last)
             try:
-                for stage in self._stages:
-                    if not stage.is_source:
-                        self._finish_leaf(stage.name, finish(stage))
+                self._finish_leaves(finish)
             finally:
                 self._end_processes()
 
-    def _finish_leaf(self, name: str, finish: Finish) -> None:
-        if name in self._processes:
-            self._processes[name].close(finish)
-            self._check(name)
-        else:
-            self.works[name].finish(finish)
+    def _finish_leaves(self, finish: Callable[[Stage], Finish]) -> None:
+        """Have the leaves finish, and sources save meanwhile."""
+        leaves = [stage for stage in self._stages if not stage.is_source]
+        for stage in leaves:
+            if stage.name in self._processes:
+                self._processes[stage.name].ask_to_finish(finish(stage))
+        try:
+            for stage in self._stages:
+                if stage.is_source and stage.name in self.works:
+                    self.works[stage.name].save(finish(stage))
+        finally:
+            for stage in leaves:
+                if stage.name in self._processes:
+                    self._processes[stage.name].close()
+                    self._check(stage.name)
+                else:
+                    self.works[stage.name].finish(finish(stage))
 
     def _pass(self, message: Message) -> None:
         """The last stages first: an image is there before its pose."""
@@ -217,8 +223,6 @@ class InOrder:
         self._closer.shutdown(cancel_futures=True)
         for process in self._processes.values():
             process.kill()
-        if self._server is not None:
-            self._server.close()
 
 
 def in_words(fault: BaseException) -> str:

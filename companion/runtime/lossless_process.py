@@ -55,9 +55,12 @@ class LosslessProcess:
         """Pass a message; waits for room."""
         self._process.offer(parcel)
 
-    def close(self, finish: Finish) -> None:
-        """Finish; the last results are given then."""
+    def ask_to_finish(self, finish: Finish) -> None:
+        """Have it finish beside what else is done; then `close`."""
         self._process.ask_to_finish(finish)
+
+    def close(self) -> None:
+        """Wait until it has finished; the last results are given then."""
         self._process.wait()
         self.kill()
 

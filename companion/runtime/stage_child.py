@@ -191,6 +191,7 @@ class _Loop:
             if isinstance(message, Finish):
                 for out in work.finish(message):
                     send(out)
+                work.save(message)
                 return
             for each in message.parts if isinstance(message, Samples) else (message,):
                 for given in work.step(each):

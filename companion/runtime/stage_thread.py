@@ -49,9 +49,12 @@ class StageThread:
         """Pass a message; waits for room."""
         self._inbox.put(message)
 
-    def close(self, finish: Finish) -> None:
-        """Finish; the last results are given then."""
+    def ask_to_finish(self, finish: Finish) -> None:
+        """Have it finish beside what else is done; then `close`."""
         self._inbox.put(finish)
+
+    def close(self) -> None:
+        """Wait until it has finished; the last results are given then."""
         self._thread.join()
 
     def _run(self) -> None:

@@ -53,6 +53,9 @@ class Work(ABC):
     def finish(self, finish: Finish) -> Iterable[Message | Snapshot]:
         """Give the last results."""
 
+    def save(self, finish: Finish) -> None:  # noqa: B027 - most have nothing to do
+        """Write what nobody waits for, once the last results are on their way."""
+
 
 class WorkModule(Protocol):
     """Module of a stage. Importing it loads all that the stage needs."""

@@ -137,6 +137,8 @@ class _Localisation(Work):
         if self._keeper is not None:
             self._keeper.close(forget=not finish.keep_map)
         yield from self._stage.finish(adjust=not finish.hurry)
+
+    def save(self, finish: Finish) -> None:
         save = finish.save_map
         if save is None or finish.hurry:  # a disk may take longer than is left
             return

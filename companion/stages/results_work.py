@@ -25,8 +25,8 @@ from companion.streaming.viewer import FileViewer
 from drivers.system.file_pages import give_back_library_pages
 
 PICTURE_EVERY_NS = 60_000_000
-"""Least interval of pictures in the viewer file in flight, as viewers get them: to encode and log
-each frame takes half of this stage's processor time."""
+"""Least interval of pictures in the viewer file, as viewers get them: to encode and log each frame
+takes half of this stage's processor time."""
 
 
 class _Results(Work):
@@ -72,7 +72,7 @@ class _Results(Work):
         return self._snapshots.step()
 
     def _is_drawn(self, frame: Frame) -> bool:
-        if self._is_live and frame.t_ns - self._drawn_ns < PICTURE_EVERY_NS:
+        if frame.t_ns - self._drawn_ns < PICTURE_EVERY_NS:
             return False
         self._drawn_ns = frame.t_ns
         return True

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from companion.app.cli.options import (
     add_flag,
@@ -28,6 +29,9 @@ from companion.config import Config, MapConfig
 from companion.config_file import load_config
 from companion.errors import InputError
 from companion.runtime.collection_pause import garbage_collection_paused
+
+if TYPE_CHECKING:
+    from companion.runtime.fork_server import ForkServer
 
 
 def _with_telemetry(arguments: argparse.Namespace) -> Config:
@@ -68,25 +72,43 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> None:
         with held_folder(arguments.out):
             replay_as_flown(arguments.flight, arguments.out, config, progress, print)
         return
-    with garbage_collection_paused():
-        from companion.app.replay.replay_command import RecordedInput, replay
-        from companion.telemetry import belief_in_words
+    with ExitStack() as stack:
+        if not arguments.paced:
+            start = stack.enter_context(_prepared_stages(config)).start
+        with garbage_collection_paused():
+            from companion.app.replay.replay_command import RecordedInput, replay
+            from companion.telemetry import belief_in_words
 
+            given = RecordedInput(arguments.flight, config, arguments.start, arguments.stop)
+        for remark in given.log.remarks:
+            print(f"telemetry: {remark}")
+        belief = belief_in_words(config.telemetry.use)
+        if belief:
+            print(f"telemetry: {belief}")
+        for fault in given.warnings:
+            print(f"warning: {fault.what}: {fault.detail}")
+        stack.enter_context(held_folder(arguments.out))
         if arguments.paced:
-            from companion.app.replay.paced_replay import replay_paced as replay
-        given = RecordedInput(arguments.flight, config, arguments.start, arguments.stop)
-    for remark in given.log.remarks:
-        print(f"telemetry: {remark}")
-    belief = belief_in_words(config.telemetry.use)
-    if belief:
-        print(f"telemetry: {belief}")
-    for fault in given.warnings:
-        print(f"warning: {fault.what}: {fault.detail}")
-    with held_folder(arguments.out):
-        replay(given, arguments.out, config, arguments.viewer, progress, print)
+            from companion.app.replay.paced_replay import replay_paced
+
+            replay_paced(given, arguments.out, config, arguments.viewer, progress, print)
+        else:
+            replay(given, arguments.out, config, arguments.viewer, progress, print, start)
         if config.export.formats:
             _export_into(arguments.out, arguments.out, config, arguments.flight)
     print(f"report: {arguments.out / 'report.html'}")
+
+
+def _prepared_stages(config: Config) -> ForkServer:
+    """Processes that import what dense map and results need, while this one makes its imports."""
+    from companion.runtime.fork_server import ForkServer
+
+    with garbage_collection_paused():
+        import companion.runtime.stage_protocol  # noqa: F401 - with what all need
+    server = ForkServer(copy=True)  # as long as there is one thread
+    for name in ("results", "depth") if config.depth.enabled else ("results",):
+        server.prepare(name)
+    return server
 
 
 def _demo(arguments: argparse.Namespace, signals: StopSignals) -> None:

@@ -32,6 +32,7 @@ from companion.products.versions import versions
 from companion.runtime.gaps import with_gap_warnings
 from companion.runtime.in_order import InOrder, in_order_of_time, in_words
 from companion.runtime.stage_protocol import Finish, SaveSiteMap, Setup
+from companion.runtime.stage_start import Start
 from companion.runtime.stages import Stage, stage_named
 from companion.streaming.live_viewer import LiveViewer
 from companion.timing.clock import monotonic_s
@@ -115,11 +116,12 @@ class RecordedInput:
 
 def replay(
     given: RecordedInput, out: Path, config: Config, viewer: str, progress: Progress,
-    notify: Callable[[str], None],
+    notify: Callable[[str], None], start: Start | None = None,
 ) -> None:  # fmt: skip
     """Replay a flight into the folder `out`; InputError when it cannot begin, or gives no map.
 
-    `notify` takes remarks: OpenCL devices refused, address of the viewer.
+    `notify` takes remarks: OpenCL devices refused, address of the viewer. With `start` dense map
+    and results get processes.
 
     Results so far are written also when it is interrupted or fails on the way. Where only the dense
     map fails, all frames are tracked and written with the cloud so far; then StageError.
@@ -141,7 +143,7 @@ def replay(
             take(message)
 
     with ExitStack() as stack:
-        stages = InOrder(map(stage_named, names), setup, watch, notify, apart=("depth", "results"))
+        stages = InOrder(map(stage_named, names), setup, watch, notify, start)
         began_s = monotonic_s()
         completed = False
 

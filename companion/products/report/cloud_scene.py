@@ -147,7 +147,9 @@ def _spacing(points: Array) -> float:
     """Median distance of a point to its nearest neighbour."""
     if len(points) < 2:
         return 1.0
-    distance, _ = cKDTree(points).query(points[:N_SPACING], k=2)
+    # for so few queries, a tree that is quick to build
+    tree = cKDTree(points, compact_nodes=False, balanced_tree=False)
+    distance, _ = tree.query(points[:N_SPACING], k=2)
     return max(float(np.median(distance[:, 1])), 1e-6)
 
 

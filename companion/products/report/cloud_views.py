@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array
 from companion.geometry.voxel import distinct_cells
-from companion.messages import Bytes
+from companion.messages import Bytes, Floats
 from companion.products.cloud import Cloud
 
 WIDTH_PX = 1100
@@ -51,11 +52,17 @@ def cloud_views(cloud: Cloud, segments: Sequence[Array]) -> list[CloudView]:
     side = f"From the side, looking {compass_point(heading)}"
     oblique_heading = oblique_heading_rad(cloud, segments)
     oblique = f"Oblique, looking {compass_point(oblique_heading)}"
-    return [
-        _view("From above", cloud, segments, 0.0, np.pi / 2, (1.3, 3.0)),
-        _view(side, cloud, segments, heading, 0.0, (1.6, 1.6)),
-        _view(oblique, cloud, segments, oblique_heading, OBLIQUE_DOWN_RAD, (1.6, 1.6)),
-    ]
+    # two at a time, as numpy and OpenCV hold up no other thread; each holds a hundred megabytes
+    with ThreadPoolExecutor(2, "views") as beside:
+        views = [
+            beside.submit(_view, cloud, segments, title, heading_rad, pitch_rad, aspects)
+            for title, heading_rad, pitch_rad, aspects in (
+                ("From above", 0.0, np.pi / 2, (1.3, 3.0)),
+                (side, heading, 0.0, (1.6, 1.6)),
+                (oblique, oblique_heading, OBLIQUE_DOWN_RAD, (1.6, 1.6)),
+            )
+        ]
+        return [view.result() for view in views]
 
 
 def side_heading_rad(cloud: Cloud, segments: Sequence[Array]) -> float:
@@ -108,27 +115,32 @@ def round_length(at_most: float) -> float:
 
 def splat(
     pixels: Array, ahead: Array, rgb: Bytes, height: int, width: int, size: int
-) -> tuple[Bytes, Array]:
+) -> tuple[Bytes, Floats]:
     """Draw points (N, 2) as squares of `size`, the nearest on top.
 
-    Returns the picture (H, W, 3) and the depth of each pixel (H, W), inf where empty.
+    Returns the picture (H, W, 3), black where empty, and the depth of each pixel (H, W), float32,
+    inf where empty.
     """
     order = np.argsort(-ahead, kind="stable")
     columns, rows = np.floor(pixels[order] + 0.5).astype(np.int64).T
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    rank = np.zeros((height, width))  # 0 is nothing, then the nearer the higher
-    rank[rows[inside], columns[inside]] = np.flatnonzero(inside) + 1.0
+    # 0 is nothing, then the nearer the higher; float32 has each whole number up to 2**24
+    rank = np.zeros((height, width), np.float32 if len(order) < 2**24 else np.float64)
+    rank[rows[inside], columns[inside]] = np.flatnonzero(inside) + 1
     rank = np.asarray(cv2.dilate(rank, np.ones((size, size), np.uint8)))
-    point = order[rank.astype(np.int64) - 1]
-    known = rank > 0
-    picture: Bytes = np.where(known[..., None], rgb[point], np.uint8(0))
-    return picture, np.where(known, ahead[point], np.inf)
+    known = np.flatnonzero(rank)
+    point = order[rank.ravel()[known].astype(np.int64) - 1]
+    picture = np.zeros((height * width, 3), np.uint8)
+    picture[known] = rgb[point]
+    nearest = np.full(height * width, np.inf, np.float32)
+    nearest[known] = ahead[point]
+    return picture.reshape(height, width, 3), nearest.reshape(height, width)
 
 
 def _view(
-    title: str,
     cloud: Cloud,
     segments: Sequence[Array],
+    title: str,
     heading_rad: float,
     pitch_rad: float,
     aspects: tuple[float, float],
@@ -147,7 +159,7 @@ def _view(
     pixels = to_pixels(seen) * FINER - 0.5
     size = _splat_px(pixels)
     picture, nearest = splat(pixels, seen[:, 2], cloud.rgb, height * FINER, width * FINER, size)
-    shaded = picture * _shade(nearest, 1 / (px_per_unit * FINER))[..., None]
+    shaded = cv2.merge([_shade(nearest, 1 / (px_per_unit * FINER))] * 3) * picture
     bar = round_length(width / px_per_unit / 4)
     return CloudView(
         title, bool(pitch_rad > 1.5), _encode(shaded, np.isfinite(nearest), width, height),
@@ -181,25 +193,28 @@ def _splat_px(pixels: Array) -> int:
     return int(np.clip(np.ceil(1.6 * 16 / np.sqrt(per_cell)), 1, MAX_SPLAT_PX))
 
 
-def _shade(nearest: Array, unit_per_px: float) -> Array:
+def _shade(nearest: Floats, unit_per_px: float) -> Floats:
     """Darken pixels behind their neighbours, so that edges show without lighting."""
     reach = 3
-    drop = np.zeros(nearest.shape)
-    filled = np.where(np.isfinite(nearest), nearest, np.nan)
-    for down, along in ((0, reach), (0, -reach), (reach, 0), (-reach, 0)):
-        step = filled - np.roll(filled, (down, along), (0, 1))
-        drop += np.clip(np.nan_to_num(step) / (unit_per_px * 40), 0, 1)
-    out: Array = np.exp(-0.35 * drop)
-    return out
+    drop = np.zeros_like(nearest)
+    known = np.isfinite(nearest)
+    # next to nothing there is no drop, on either side
+    far, near = np.where(known, nearest, -np.inf), np.where(known, nearest, np.inf)
+    for here, beside in ((slice(reach, None), slice(-reach)), (slice(-reach), slice(reach, None))):
+        for rows, others in ((np.s_[:, here], np.s_[:, beside]), (np.s_[here], np.s_[beside])):
+            step = far[rows] - near[others]
+            step *= 1 / (unit_per_px * 40)
+            drop[rows] += np.clip(step, 0, 1, out=step)
+    drop *= -0.35
+    return np.exp(drop, out=drop)
 
 
-def _encode(picture: Array, known: NDArray[np.bool_], width: int, height: int) -> bytes:
-    """Downscale to the final size with smooth edges, and encode."""
-    solid = known.astype(np.float32)
-    full = np.dstack([picture[..., ::-1].astype(np.float32) * solid[..., None], solid])
-    small = cv2.resize(full, (width, height), interpolation=cv2.INTER_AREA)
-    alpha = small[..., 3:]
-    colour = small[..., :3] / np.maximum(alpha, 1e-6)
-    image = np.dstack([colour, alpha * 255]).round().clip(0, 255).astype(np.uint8)
+def _encode(picture: Floats, known: NDArray[np.bool_], width: int, height: int) -> bytes:
+    """Downscale to the final size with smooth edges, and encode; `picture` is black where empty."""
+    size = width, height
+    alpha = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    colour = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    colour = colour / np.maximum(alpha, 1e-6)[..., None]
+    image = np.dstack([colour[..., ::-1], alpha * 255]).round().clip(0, 255).astype(np.uint8)
     _, data = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, 82])
     return data.tobytes()

@@ -43,7 +43,8 @@ def tiny(monkeypatch: pytest.MonkeyPatch, remarks: list[str]) -> Iterator[Lossle
 
 
 def given_at_last(tiny: LosslessProcess) -> list[Any]:
-    tiny.close(NOT_HURRIED)
+    tiny.ask_to_finish(NOT_HURRIED)
+    tiny.close()
     return [tiny.given.get().open() for _ in range(tiny.given.qsize())]
 
 
