@@ -6,7 +6,7 @@ Frames are buffered up to a bound.
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +34,9 @@ from companion.timing.clock import Timer
 LAG_KEYFRAMES = 2
 """Later keyframes waited for, whose frames and adjusted poses are used."""
 MAX_FRAMES = 100
+MAX_COLOURED = 30
+"""Newest frames that may still be told to be keyframes: at 30/s within a second, which mapping
+takes only where there is too much to do."""
 FIRST_BASELINE = 0.01
 """Ratio of the median depth: with a short baseline the search is hardly ambiguous."""
 N_UPDATES = MAX_VIEWS + 1
@@ -78,6 +81,8 @@ class DepthStage:
         )
         self._times = times
         self._frames: OrderedDict[int, _BufferedFrame] = OrderedDict()
+        self._coloured: deque[int] = deque()
+        """Newest of the frames, which have their colours."""
         self._waiting: list[KeyframeAdded] = []
         self._update: MapUpdate | None = None
         self._last_reference: int | None = None
@@ -101,7 +106,7 @@ class DepthStage:
                 buffered.track = message
         elif isinstance(message, KeyframeAdded):
             self._waiting.append(message)
-            self._drop_colours()
+            self._drop_colours(before=message.seq)
         elif isinstance(message, MapUpdate):
             self._update = message
             out: list[Message] = []
@@ -133,6 +138,9 @@ class DepthStage:
             for seq in old[::2]:
                 if seq not in needed:
                     del self._frames[seq]
+        self._coloured.append(frame.seq)
+        if len(self._coloured) > MAX_COLOURED:
+            self._drop_colours(before=self._coloured[1])
 
     def _process(self, keyframe: KeyframeAdded) -> list[Message]:
         update, buffered = self._update, self._frames.get(keyframe.seq)
@@ -140,7 +148,7 @@ class DepthStage:
         if update is None or buffered is None or place is None or len(keyframe.points_camera) < 20:
             return []
         if buffered.rgb is None:
-            return []  # a keyframe that was told after later ones were done
+            return []  # a keyframe that was told after a later one, or too late
         z = keyframe.points_camera[:, 2]
         z = z[z > 0]
         if not self._sees_new_area(keyframe, place, float(np.median(z))):
@@ -242,15 +250,16 @@ class DepthStage:
         baselines = {seq: b for b, seq, _ in candidates}
         return sorted(chosen, key=lambda c: (baselines[c[0]], c[0]))
 
-    def _drop_colours(self) -> None:
-        """Drop the colours of frames before the oldest pending keyframe, which are none.
+    def _drop_colours(self, before: int) -> None:
+        """Drop the colours of frames before one, but of pending keyframes.
 
         They are the larger part of a frame, and only those of keyframes are used.
         """
-        oldest = min(k.seq for k in self._waiting)
-        for seq, buffered in self._frames.items():
-            if seq < oldest:
-                buffered.rgb = None
+        pending = {k.seq for k in self._waiting}
+        while self._coloured and self._coloured[0] < before:
+            seq = self._coloured.popleft()
+            if seq in self._frames and seq not in pending:
+                self._frames[seq].rgb = None
 
     def _drop_frames(self, keyframe: KeyframeAdded) -> None:
         """Drop frames older than pending keyframes can use."""

@@ -23,6 +23,10 @@ minute."""
 PATIENCE_S = 30.0
 """A depth map takes 0.1 to 2 s, on an overloaded processor 20 s."""
 
+MAPS_PER_TRIM = 20
+"""Depth maps after which the heap is returned again, which takes milliseconds: of what frames and
+depth maps free of it, 10 to 20 MB would stay."""
+
 
 class _Depth(Work):
     def __init__(self, setup: Setup) -> None:
@@ -33,6 +37,7 @@ class _Depth(Work):
         """Identity of the device that was last at work."""
         self._proven: set[str] = set()
         """Devices that have made a depth map."""
+        self._n_maps = 0
         self._devices: Devices | None = None
         self._stage: DepthStage | None = None
 
@@ -59,9 +64,13 @@ class _Depth(Work):
             self._stage.set_share(message.level)
             return []
         out = self._stage.step(message)
-        if self._used not in self._proven and any(isinstance(each, DepthMap) for each in out):
-            self._proven.add(self._used)
-            self._give_back()  # drivers compile kernels when these first run
+        if any(isinstance(each, DepthMap) for each in out):
+            self._n_maps += 1
+            if self._used not in self._proven:
+                self._proven.add(self._used)
+                self._give_back()  # drivers compile kernels when these first run
+            elif self._setup.is_live and self._n_maps % MAPS_PER_TRIM == 0:
+                give_back_heap()
         self.device = self._devices.described
         return out
 

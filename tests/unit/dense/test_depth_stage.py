@@ -12,7 +12,7 @@ import pytest
 
 from companion.config import CloudConfig, DepthConfig
 from companion.dense import device_takeover
-from companion.dense.depth_stage import MAX_FRAMES, DepthStage
+from companion.dense.depth_stage import MAX_COLOURED, MAX_FRAMES, DepthStage
 from companion.dense.device_takeover import FAILED_OVER, NO_DEVICE_LEFT, Devices
 from companion.dense.self_test import SelfTest
 from companion.geometry.camera import Camera, Distortion
@@ -125,6 +125,8 @@ def test_frame_buffer_is_bounded_while_hovering(monkeypatch: pytest.MonkeyPatch)
         it.step(Frame(k, k, grey, np.repeat(grey[..., None], 3, 2)))
         it.step(Track(k, k, TrackState.TRACKING, Pose.identity(), 0, Pose.identity(), 50))
     assert len(it._frames) <= MAX_FRAMES + 1
+    coloured = [seq for seq, each in it._frames.items() if each.rgb is not None]
+    assert coloured == list(range(3 * MAX_FRAMES - MAX_COLOURED, 3 * MAX_FRAMES))
 
 
 def test_colours_are_kept_only_where_a_keyframe_may_be() -> None:
