@@ -92,7 +92,8 @@ class Atlas:
 
     def mapper_of(self, segment: SlamMap) -> Mapper:
         """Mapper of a map."""
-        return Mapper(self._camera, segment, self._map_lock, self.displacements_of)
+        forget = self.far_file.forget if self.far_file is not None else lambda: None
+        return Mapper(self._camera, segment, self._map_lock, self.displacements_of, forget)
 
     def new_map(self, level: bool) -> None:
         """Activate a new map; an active one that is too young is discarded."""

@@ -34,6 +34,9 @@ class ArrayFile(Protocol):
     def put(self, arrays: Sequence[Any]) -> list[Any] | None:
         """Equal arrays, which are read from the file as they are used; None where it is full."""
 
+    def forget(self) -> None:
+        """Give back the memory of what was read."""
+
 
 def put_away(seen: Seen, file: ArrayFile) -> Seen:
     """A copy in a file, if that takes it, of what a keyframe saw that nothing changes any more."""

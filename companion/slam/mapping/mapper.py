@@ -58,14 +58,19 @@ N_IMAGES_KEPT = 100
 
 
 class Mapper:
-    """Local mapping, run once per keyframe."""
+    """Local mapping, run once per keyframe.
+
+    `part_done` is called after each window of a global adjustment: keyframes that were read for it
+    need not stay in memory.
+    """
 
     def __init__(
         self, camera: Camera, slam_map: SlamMap, map_lock: MapLock,
         displacements_of: DisplacementSource = no_displacements,
+        part_done: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
         self._camera, self._displacements_of = camera, displacements_of
-        self._map_lock = map_lock
+        self._map_lock, self._part_done = map_lock, part_done
         self._map = slam_map
         self.fusion = PointFusion(camera, slam_map, map_lock)
 
@@ -261,6 +266,7 @@ class Mapper:
         """Global bundle adjustment, windowed for long flights."""
         for variable, fixed, mask in partition(self._map):
             self._adjust(variable, fixed, mask, iterations)
+            self._part_done()
 
     def adjust_all_in_background(
         self, iterations: int, yield_point: Callable[[], None], still_valid: Callable[[], bool]
@@ -288,6 +294,7 @@ class Mapper:
                 if not still_valid():
                     return
                 apply_result_later(self._map, problem, result)
+            self._part_done()
 
     def _adjust(
         self,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from companion.config import FeaturesConfig
 from companion.geometry.transforms import Similarity, yaw_rotation
 from companion.products.array_file import ArrayFile
 from companion.products.site_map_file import read_site_map, write_site_map
@@ -24,7 +25,9 @@ from companion.slam.map.patch_store import NO_PATCH
 from companion.slam.map.site_map import SiteGeoreference, SitePart, site_map_of, slam_map_of
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping import far_keyframes
+from companion.slam.mapping.atlas import Atlas
 from companion.slam.mapping.far_keyframes import leave_behind
+from companion.slam.mapping.map_adjustment import partition
 from companion.slam.mapping.mapper import Mapper
 from companion.slam.mapping.mapping_worker import MapLock
 from tests.support.reference.synthetic_map import CAMERA, GREY, Ground, bend, flown, mapped
@@ -169,6 +172,24 @@ def test_a_map_read_into_the_file_is_that_in_memory(tmp_path: Path) -> None:
         maps.append(here)
     assert file.n_bytes > 500_000 and (maps[1].patch_at < NO_PATCH).sum() > 500
     assert_same(*maps)
+
+
+def test_each_window_of_a_large_adjustment_may_be_forgotten(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.slam.mapping.map_adjustment.MAX_VARIABLE", 8)
+    file, n_forgotten = ArrayFile(tmp_path), []
+    atlas = Atlas(FeaturesConfig(), CAMERA, MapLock())
+    atlas.far_file = file
+    monkeypatch.setattr(file, "forget", lambda: n_forgotten.append(1))
+    slam_map = flown_round(file)
+    n_windows = len(list(partition(slam_map)))
+    n_forgotten.clear()
+    mapper = atlas.mapper_of(slam_map)
+    mapper.adjust_all(1)
+    assert len(n_forgotten) == n_windows > 3
+    mapper.adjust_all_in_background(1, lambda: None, lambda: True)
+    assert len(n_forgotten) == 2 * n_windows
 
 
 def held(slam_map: SlamMap) -> list[Keyframe]:
