@@ -122,6 +122,8 @@ def _move(
 ) -> None:
     anchors = _anchors(slam_map, np.array(keys))
     n = slam_map.n_points
+    by_anchor = np.argsort(anchors, kind="stable")
+    begins = np.searchsorted(anchors[by_anchor], np.arange(len(keys) + 1))
     scales: Array = np.ones(n)
     index = {key: row for row, key in enumerate(keys)}
     for row, (key, old, new) in enumerate(zip(keys, before, after, strict=True)):
@@ -129,7 +131,7 @@ def _move(
         keyframe = slam_map.keyframes[key]
         keyframe.camera_from_map = Pose(new.rotation, new.translation).inverse()
         slam_map.unit_of[key] = slam_map.unit_of.get(key, 1.0) * new.scale
-        own = np.flatnonzero(anchors == row)
+        own = by_anchor[begins[row] : begins[row + 1]]
         slam_map.positions[own] = moved.apply(slam_map.positions[own])
         slam_map.normals[own] = slam_map.normals[own] @ moved.rotation.T
         scales[own] = moved.scale
