@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 from companion.errors import CompanionError
@@ -148,10 +149,13 @@ class InOrder:
     def finish(self, finish: Callable[[Stage], Finish]) -> None:
         """Complete the map and the depth maps, then the results."""
         last: list[Any] = []
+        saves: list[Callable[[], None]] = []
         try:
             for stage in self._stages:
                 if stage.is_source and stage.name != DEPTH:
-                    last += self.works[stage.name].finish(finish(stage))
+                    work, asked = self.works[stage.name], finish(stage)
+                    last += work.finish(asked)
+                    saves.append(partial(work.save, asked))
         finally:  # results so far are written, whatever has failed
             # before the final map comes: what it is measured by is that of its own time
             if self._depth is not None:
@@ -160,20 +164,21 @@ class InOrder:
                 self.collect()
             self._publish(last)
             try:
-                self._finish_leaves(finish)
+                self._finish_leaves(finish, saves)
             finally:
                 self._end_processes()
 
-    def _finish_leaves(self, finish: Callable[[Stage], Finish]) -> None:
-        """Have the leaves finish, and sources save meanwhile."""
+    def _finish_leaves(
+        self, finish: Callable[[Stage], Finish], saves: Iterable[Callable[[], None]]
+    ) -> None:
+        """Have the leaves finish, and sources that have finished save meanwhile."""
         leaves = [stage for stage in self._stages if not stage.is_source]
         for stage in leaves:
             if stage.name in self._processes:
                 self._processes[stage.name].ask_to_finish(finish(stage))
         try:
-            for stage in self._stages:
-                if stage.is_source and stage.name in self.works:
-                    self.works[stage.name].save(finish(stage))
+            for save in saves:
+                save()
         finally:
             for stage in leaves:
                 if stage.name in self._processes:

@@ -17,6 +17,9 @@ from companion.slam.optimisation.pose_graph import Edge, relax
 MIN_SHARED_POINTS = 30
 EDGES_EACH = 6
 LOOP_WEIGHT = 5.0
+LEAST_BENT = 5e-4
+"""Map units, radians, and a ratio less one: at the depth of one unit, with which a map begins, a
+quarter of a pixel of a focal length of 500."""
 YIELD_EVERY = 10
 """Keyframes whose covisible ones are found in some milliseconds."""
 
@@ -60,6 +63,24 @@ class LoopGraph:
     def relaxed(self) -> list[Similarity]:
         """Nodes that agree with the loop. Takes long, and needs nothing of the map."""
         return relax(self.nodes, self.edges, self.held or (self.oldest,), self.level)
+
+    def bent(self, relaxed: list[Similarity]) -> set[int]:
+        """Keyframes that the loop moves against others, so that adjustment would move them, too."""
+        i, j = np.array([(edge.i, edge.j) for edge in self.edges]).T
+        bent = np.zeros(len(i), bool)
+        for before, after in zip(_between(self.nodes, i, j), _between(relaxed, i, j), strict=True):
+            bent |= np.abs(after - before).reshape(len(i), -1).max(1) > LEAST_BENT
+        return {self.keys[row] for row in np.union1d(i[bent], j[bent]).tolist()}
+
+
+def _between(nodes: list[Similarity], i: Ints, j: Ints) -> tuple[Array, Array, Array]:
+    """Rotations (E, 3, 3), translations (E, 3) and logarithms of scales (E,) of j in i."""
+    rotation = np.stack([node.rotation for node in nodes])
+    place = np.stack([node.translation for node in nodes])
+    scale = np.array([node.scale for node in nodes])
+    back = rotation[i].transpose(0, 2, 1)
+    offset = (back @ (place[j] - place[i])[..., None])[..., 0] / scale[i, None]
+    return back @ rotation[j], offset, np.log(scale[j] / scale[i])
 
 
 def loop_graph(

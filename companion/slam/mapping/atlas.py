@@ -62,6 +62,9 @@ class Atlas:
         self.free_index()
         self._cooldown = 0
         self._pending: SlamMap | None = None
+        """Map that is to be adjusted in idle time."""
+        self._bent: set[int] = set()
+        """Keyframes that loops have moved against others since it was."""
         self.site: SlamMap | None = None
         """Map of an earlier flight, until the active one is found in it."""
         self._site_finder = LoopDetector(KeyframeDatabase(), self._relocalizer)
@@ -262,6 +265,7 @@ class Atlas:
         if not same:
             offset = segment.n_points
             merge_maps(segment, found.there, here_from_there)
+            self._bent.update(segment.keyframes)
             self.on_merge(segment, found.there, here_from_there)
             self.segments = [s for s in self.segments if s is not found.there]
             seen_there = seen_there + offset
@@ -269,9 +273,11 @@ class Atlas:
             graph = loop_graph(segment, found, self._map_lock.yield_to_tracking)
             with self._map_lock.released():
                 relaxed = graph.relaxed()
+                bent = graph.bent(relaxed)
             if segment is not self.map:
                 return None
             moved = close_loop(segment, graph, relaxed)
+            self._bent |= bent
         self.n_loops += 1
         mapper.close_loop(keyframe, other, seen_there)
         if found.there is self.site:
@@ -280,7 +286,8 @@ class Atlas:
             mapper.adjust_locally(other)
             self._pending = segment if not same or moved else self._pending
         elif not same or moved:
-            mapper.adjust_all(LOOP_ITERATIONS)
+            mapper.adjust_all(LOOP_ITERATIONS, self._bent)
+            self._bent.clear()
         return LoopClosed(
             keyframe.t_ns,
             keyframe.keyframe_id,
@@ -303,14 +310,16 @@ class Atlas:
         """Globally adjust maps with closed loops while they go on; an `IdleWork`."""
         while self._pending is not None:
             segment, self._pending = self._pending, None
-            n_loops = self.n_loops
+            n_loops, bent = self.n_loops, self._bent.copy()
 
             def still_valid(segment: SlamMap = segment, n_loops: int = n_loops) -> bool:
                 return self.n_loops == n_loops and segment in self.segments
 
             self.mapper_of(segment).adjust_all_in_background(
-                LOOP_ITERATIONS, yield_point, still_valid
+                LOOP_ITERATIONS, yield_point, still_valid, bent
             )
+            if still_valid():
+                self._bent -= bent
 
     def _plausible(self, found: LoopClosure, same: bool) -> bool:
         if same and not _within_drift(found):

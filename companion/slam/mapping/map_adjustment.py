@@ -6,7 +6,7 @@ keyframes, in one step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -189,12 +189,15 @@ def is_without_attitude(slam_map: SlamMap) -> bool:
     return not any(k.ned_from_camera is not None for k in slam_map.keyframes.values())
 
 
-def partition(slam_map: SlamMap) -> Iterator[tuple[list[Keyframe], list[Keyframe], Bools]]:
+def partition(
+    slam_map: SlamMap, bent: Collection[int] | None = None
+) -> Iterator[tuple[list[Keyframe], list[Keyframe], Bools]]:
     """Variable keyframes, fixed keyframes and point mask of each problem of a global adjustment.
 
     The first two keyframes are held, or those of an earlier flight; the first alone where no
     attitude is known (`Mapper.adjust_locally`). A long flight is adjusted in overlapping windows,
-    each held by covisible keyframes.
+    each held by covisible keyframes; where the keyframes `bent` are given, only those windows that
+    have one.
     """
     ordered = sorted(slam_map.keyframes.values(), key=lambda k: k.keyframe_id)
     n_held = 1 if is_without_attitude(slam_map) else 2
@@ -207,6 +210,8 @@ def partition(slam_map: SlamMap) -> Iterator[tuple[list[Keyframe], list[Keyframe
         return
     for start in range(0, len(free), MAX_VARIABLE // 2):
         part = free[start : start + MAX_VARIABLE]
+        if bent is not None and not any(k.keyframe_id in bent for k in part):
+            continue
         mask = np.zeros(slam_map.n_points, bool)
         for k in part:
             mask[slam_map.observations_of(k)[1]] = True

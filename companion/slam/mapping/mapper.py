@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from itertools import islice
 
 import numpy as np
@@ -262,22 +262,23 @@ class Mapper:
         for _ in range(FINAL_ROUNDS):
             self.adjust_all(FINAL_ITERATIONS)
 
-    def adjust_all(self, iterations: int) -> None:
-        """Global bundle adjustment, windowed for long flights."""
-        for variable, fixed, mask in partition(self._map):
+    def adjust_all(self, iterations: int, bent: Collection[int] | None = None) -> None:
+        """Global bundle adjustment, windowed for long flights; see `partition`."""
+        for variable, fixed, mask in partition(self._map, bent):
             self._adjust(variable, fixed, mask, iterations)
             self._part_done()
 
     def adjust_all_in_background(
-        self, iterations: int, yield_point: Callable[[], None], still_valid: Callable[[], bool]
-    ) -> None:
+        self, iterations: int, yield_point: Callable[[], None], still_valid: Callable[[], bool],
+        bent: Collection[int] | None = None,
+    ) -> None:  # fmt: skip
         """Global bundle adjustment while the map goes on; called without the map lock.
 
         `yield_point` is called every few milliseconds and may change the map; results are applied
-        while `still_valid` holds.
+        while `still_valid` holds. For `bent` see `partition`.
         """
         with self._map_lock.mapping():
-            parts = list(partition(self._map))
+            parts = list(partition(self._map, bent))
         for variable, fixed, mask in parts:
             with self._map_lock.mapping():
                 stayed = self._map.keyframes.keys()

@@ -26,6 +26,7 @@ from companion.slam.loop.place_recognition import KeyframeDatabase
 from companion.slam.loop.relocalizer import Relocalizer
 from companion.slam.map.sparse_map import SlamMap
 from companion.slam.mapping.atlas import Atlas
+from companion.slam.mapping.map_adjustment import partition
 from companion.slam.mapping.mapping_worker import MapLock
 from companion.slam.optimisation.pose_graph import Edge, relax
 from companion.slam.optimisation.upright_pose import upright_pose
@@ -162,6 +163,31 @@ def test_loop_closure_moves_its_points() -> None:
     p = keyframe.camera_from_map.apply(slam_map.positions[points[own]])
     error = CAMERA.project(p) - keyframe.features.pixels[features[own]]
     assert np.median(np.linalg.norm(error, axis=1)) < 1.5
+
+
+def test_windows_that_a_loop_does_not_bend_are_not_adjusted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Out and back to the middle: what was flown before the middle turns as a whole."""
+    monkeypatch.setattr("companion.slam.mapping.map_adjustment.MAX_VARIABLE", 6)
+    ground = Ground(np.random.default_rng(6))
+    corners = [(-24.0, 20.0), (-24.0, 0.0), (0.0, 0.0), (16.0, 0.0), (16.0, 16.0), (0.0, 16.0)]
+    sides = itertools.pairwise([*corners, (0.0, 1.0)])
+    path = [pose for a, b in sides for pose in line(a, b, 9, 0.0)]
+    slam_map = mapped(ground, path, NOWHERE, memory=12)
+    bend(slam_map, 0.05)
+    newest = max(slam_map.keyframes)
+    found = find(newest, slam_map, [slam_map])
+    assert found is not None
+    middle = found.relocalised.keyframe.keyframe_id
+    assert 12 < middle < 22
+    graph = loop_graph(slam_map, found)
+    bent = graph.bent(graph.relaxed())
+    assert newest in bent and min(bent) >= middle - 3 and len(bent) > 20
+    windows = [{k.keyframe_id for k in part} for part, _, _ in partition(slam_map)]
+    adjusted = [{k.keyframe_id for k in part} for part, _, _ in partition(slam_map, bent)]
+    assert adjusted == [window for window in windows if window & bent]
+    assert 0 < len(windows) - len(adjusted) <= middle
 
 
 def test_frames_are_tracked_while_the_graph_of_a_loop_is_relaxed(
