@@ -126,7 +126,8 @@ class PictureServer:
             due = self._waiting.get()
             if due is None:
                 return
-            self._stop.wait(max(0.0, due.due_s - time.time()))
+            if self._stop.wait(max(0.0, due.due_s - time.time())):
+                return  # it is not due yet
             client, taken = self._client, False
             late_s = time.time() - due.due_s
             if client is not None:
