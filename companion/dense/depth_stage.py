@@ -34,9 +34,10 @@ from companion.timing.clock import Timer
 LAG_KEYFRAMES = 2
 """Later keyframes waited for, whose frames and adjusted poses are used."""
 MAX_FRAMES = 100
-MAX_COLOURED = 30
-"""Newest frames that may still be told to be keyframes: at 30/s within a second, which mapping
-takes only where there is too much to do."""
+LEAST_COLOURED, LAGS = 30, 10
+"""Newest frames that may still be told to be keyframes: so many, or twice as many as have come
+before one of the last keyframes was told. With two thirds of two cores in use that is after 6
+frames of 30/s, and 21 at most; a first keyframe waits for the second of its map."""
 FIRST_BASELINE = 0.01
 """Ratio of the median depth: with a short baseline the search is hardly ambiguous."""
 N_UPDATES = MAX_VIEWS + 1
@@ -83,6 +84,9 @@ class DepthStage:
         self._frames: OrderedDict[int, _BufferedFrame] = OrderedDict()
         self._coloured: deque[int] = deque()
         """Newest of the frames, which have their colours."""
+        self._lags: deque[int] = deque([MAX_FRAMES], LAGS)
+        """Frames that came before each of the last keyframes was told."""
+        self._newest_seq = 0
         self._waiting: list[KeyframeAdded] = []
         self._update: MapUpdate | None = None
         self._last_reference: int | None = None
@@ -106,6 +110,7 @@ class DepthStage:
                 buffered.track = message
         elif isinstance(message, KeyframeAdded):
             self._waiting.append(message)
+            self._lags.append(self._newest_seq - message.seq)
             self._drop_colours(before=message.seq)
         elif isinstance(message, MapUpdate):
             self._update = message
@@ -139,7 +144,8 @@ class DepthStage:
                 if seq not in needed:
                     del self._frames[seq]
         self._coloured.append(frame.seq)
-        if len(self._coloured) > MAX_COLOURED:
+        self._newest_seq = frame.seq
+        while len(self._coloured) > max(LEAST_COLOURED, 2 * max(self._lags)):
             self._drop_colours(before=self._coloured[1])
 
     def _process(self, keyframe: KeyframeAdded) -> list[Message]:

@@ -12,7 +12,7 @@ import pytest
 
 from companion.config import CloudConfig, DepthConfig
 from companion.dense import device_takeover
-from companion.dense.depth_stage import MAX_COLOURED, MAX_FRAMES, DepthStage
+from companion.dense.depth_stage import LAGS, MAX_FRAMES, DepthStage
 from companion.dense.device_takeover import FAILED_OVER, NO_DEVICE_LEFT, Devices
 from companion.dense.self_test import SelfTest
 from companion.geometry.camera import Camera, Distortion
@@ -20,6 +20,7 @@ from companion.geometry.transforms import Pose
 from companion.messages import (
     DepthMap,
     Frame,
+    KeyframeAdded,
     Message,
     PointChunk,
     Track,
@@ -125,8 +126,21 @@ def test_frame_buffer_is_bounded_while_hovering(monkeypatch: pytest.MonkeyPatch)
         it.step(Frame(k, k, grey, np.repeat(grey[..., None], 3, 2)))
         it.step(Track(k, k, TrackState.TRACKING, Pose.identity(), 0, Pose.identity(), 50))
     assert len(it._frames) <= MAX_FRAMES + 1
-    coloured = [seq for seq, each in it._frames.items() if each.rgb is not None]
-    assert coloured == list(range(3 * MAX_FRAMES - MAX_COLOURED, 3 * MAX_FRAMES))
+
+
+@pytest.mark.parametrize(("lag", "n_coloured"), [(6, 30), (25, 50)])
+def test_a_hover_keeps_colours_for_as_long_as_keyframes_take(lag: int, n_coloured: int) -> None:
+    """Map updates are left out, so that no depth map is made."""
+    it = stage(RADTAN)
+    grey = np.zeros((RADTAN.height, RADTAN.width), np.uint8)
+    told_of = range(40, 40 + 12 * LAGS, 12)
+    for seq in range(400):
+        it.step(Frame(seq, seq, grey, np.repeat(grey[..., None], 3, 2)))
+        if seq - lag in told_of:
+            it.step(KeyframeAdded(seq, seq - lag, seq, Pose.identity(), np.zeros((0, 3))))
+            assert it._frames[seq - lag].rgb is not None
+    coloured = {seq for seq, each in it._frames.items() if each.rgb is not None}
+    assert coloured - set(told_of) == set(range(400 - n_coloured, 400))
 
 
 def test_colours_are_kept_only_where_a_keyframe_may_be() -> None:
