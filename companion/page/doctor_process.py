@@ -33,15 +33,25 @@ class Doctor:
         """True while it examines."""
         return self._lock.locked()
 
-    async def examine(self, *set_names: str) -> dict[str, Any]:
-        """Examine, and set these parameters first; what was found."""
+    async def examine(self) -> dict[str, Any]:
+        """Examine; what was found."""
+        return await self._ask()
+
+    async def set_one(self, name: str) -> dict[str, Any]:
+        """Set this parameter to what is wanted; what was found after it."""
+        return await self._ask("--write", "--yes", "--only", name)
+
+    async def set_all(self) -> dict[str, Any]:
+        """Set all that can be set; what was found after it.
+
+        These can be more than were found before: a value that is set can ask for another one, and
+        the measured latency changes.
+        """
+        return await self._ask("--write", "--yes")
+
+    async def _ask(self, *options: str) -> dict[str, Any]:
         async with self._lock:
-            arguments = ["doctor", "--json"]
-            if set_names:
-                arguments += ["--write", "--yes"]
-                for name in set_names:
-                    arguments += ["--only", name]
-            self.found = await _document([*arguments, *self._facts.arguments()])
+            self.found = await _document(["doctor", "--json", *options, *self._facts.arguments()])
             return self.found
 
 

@@ -134,6 +134,7 @@ def test_parameters_are_set_by_buttons(page: Any, paged: Paged) -> None:
     assert words is not None
     first.click()
     page.get_by_text(f"{words[1]} is now {float(words[2]):g}").wait_for()
+    page.wait_for_load_state()  # the note is there before the buttons
     assert paged.autopilot.parameters[words[1]] == pytest.approx(float(words[2]))
     if page.get_by_role("button", name="Set all that can be set").count():
         press(page, "Set all that can be set")

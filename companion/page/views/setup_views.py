@@ -82,11 +82,11 @@ class SetupViews:
         settable = [
             each["name"] for each in found.get("in_the_way", ()) if each["set_to"] is not None
         ]
-        wanted = settable if form.get("all") else [name]
-        if not settable or not set(wanted) <= set(settable):
+        set_all = bool(form.get("all"))
+        if not settable or not (set_all or name in settable):
             raise RefusedError("Examine the parameters first.")
         self._check_free()
-        found = await self._doctor.examine(*wanted)
+        found = await (self._doctor.set_all() if set_all else self._doctor.set_one(name))
         if "error" in found:
             raise RefusedError(found["error"])
         said = [f"{each['name']} is now {each['to']:g}" for each in found["written"]]
