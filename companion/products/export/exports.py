@@ -25,7 +25,7 @@ from companion.products.export.mesh import Mesh, mesh_of
 from companion.products.export.mesh_files import mesh_gltf, mesh_ply, textured_gltf
 from companion.products.export.path_geo import path_geojson, path_gpx, path_kml
 from companion.products.export.path_tables import path_euroc, path_kitti, times_kitti
-from companion.products.export.reconstruction import colmap_files, nerfstudio_files
+from companion.products.export.reconstruction import MOST_TRACKED, colmap_files, nerfstudio_files
 from companion.products.export.surface import Surface, surface_of
 from companion.products.export.surface_tiff import mosaic_tiff, orthomosaic_tiff, surface_tiff
 from companion.products.export.textured_mesh import TexturedMesh, textured_mesh
@@ -108,10 +108,14 @@ class Product(NamedTuple):
     folder: Callable[[Export], Iterator[tuple[str, bytes]]] | None = None
 
 
-POSED = [
+POSED = (
     "Pictures: undistorted, of a pinhole camera. Poses are those of the path; points are the dense "
-    "cloud's, without tracks: which feature was seen in which picture is not kept."
-]
+    "cloud's."
+)
+TRACKED = (
+    f"Up to {MOST_TRACKED} points have tracks: the pixels where pictures show them, by their "
+    "poses. No feature was matched there."
+)
 PRODUCTS: Mapping[str, Product] = {
     "ply": Product(
         "cloud, local NED", {"cloud.ply": lambda e: (e.run.path / "cloud.ply").read_bytes()}
@@ -169,14 +173,14 @@ PRODUCTS: Mapping[str, Product] = {
         "pictures, poses and cloud for COLMAP",
         {},
         Axes.LOCAL,
-        lambda _: POSED,
+        lambda _: [POSED, TRACKED],
         lambda e: colmap_files(e.pictures),
     ),
     "nerfstudio": Product(
         "the same for nerfstudio",
         {},
         Axes.EAST_NORTH_UP,
-        lambda _: POSED,
+        lambda _: [POSED],
         lambda e: nerfstudio_files(e.pictures),
     ),
     "tum": Product(

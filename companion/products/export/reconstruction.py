@@ -12,48 +12,77 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
+from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, quaternion_from_rotation
 from companion.messages import Bytes
 from companion.products.cloud import Cloud
 from companion.products.export.flight_pictures import FlightPictures, PlacedPicture, enu
+from companion.products.export.mesh import Ints
+from companion.products.export.picture_sight import depth_buffer, is_uncovered, projected, within
 
 STEP = 0.15
 """Pictures apart by this share of the distance: neighbours overlap by 80 % or so."""
 JPEG_QUALITY = 95
+MOST_TRACKED = 30_000
+"""Points with a track: programs choose by them which pictures show the same."""
 PLY_POINT = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
 
 
 def colmap_files(pictures: FlightPictures) -> Iterator[tuple[str, bytes]]:
     """images/ and sparse/0 with cameras.txt, images.txt and points3D.txt: names and contents.
 
-    Axes are local NED. Points have no tracks: which feature was seen where is not kept. COLMAP's
-    centre of the first pixel is (0.5, 0.5), ours (0, 0).
+    Axes are local NED. Points have tracks, up to MOST_TRACKED of them, evenly from all: the pixels
+    where pictures show them, by their poses. No feature was matched there. COLMAP's centre of the
+    first pixel is (0.5, 0.5), ours (0, 0).
     """
-    k = pictures.camera
+    k, cloud = pictures.camera, pictures.run.cloud
     camera = (
         f"1 PINHOLE {k.width} {k.height} {k.fx:.9g} {k.fy:.9g} {k.cx + 0.5:.9g} {k.cy + 0.5:.9g}"
     )
-    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[]: none"]
-    for n, picture in enumerate(pictures.spaced(STEP), 1):
-        name = _name(picture)
-        camera_from_world = picture.pose.world_from_camera.inverse()
+    every = -(-len(cloud) // MOST_TRACKED) or 1
+    images, seen = [], []
+    for picture in pictures.spaced(STEP):
+        seen.append(_seen(cloud, every, picture, pictures.camera))
+        images.append((picture.pose.world_from_camera.inverse(), _name(picture)))
+        yield f"images/{_name(picture)}", _jpeg(picture.rgb)
+    times_seen = np.bincount(np.concatenate([ids for ids, _ in seen]), minlength=len(cloud))
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[]"]
+    tracks: dict[int, list[str]] = {}
+    for n, ((camera_from_world, name), (ids, pixels)) in enumerate(
+        zip(images, seen, strict=True), 1
+    ):
         turn = quaternion_from_rotation(camera_from_world.rotation)
         numbers = " ".join(f"{v:.12g}" for v in (*turn, *camera_from_world.translation))
-        lines += [f"{n} {numbers} 1 {name}", ""]
-        yield f"images/{name}", _jpeg(picture.rgb)
-    cloud = pictures.run.cloud
+        often = times_seen[ids] > 1  # seen once, a point tells nothing of the pictures
+        ids, pixels = ids[often].tolist(), (pixels[often] + 0.5).tolist()
+        shown = " ".join(f"{x:.2f} {y:.2f} {i + 1}" for i, (x, y) in zip(ids, pixels, strict=True))
+        lines += [f"{n} {numbers} 1 {name}", shown]
+        for place, i in enumerate(ids):
+            tracks.setdefault(i, []).append(f"{n} {place}")
     points = [
-        f"{n} {x:.6g} {y:.6g} {z:.6g} {red} {green} {blue} 0"
-        for n, ((x, y, z), (red, green, blue)) in enumerate(
-            zip(cloud.points.tolist(), cloud.rgb.tolist(), strict=True), 1
+        " ".join([f"{i + 1} {x:.6g} {y:.6g} {z:.6g} {red} {green} {blue} 0", *tracks.get(i, ())])
+        for i, ((x, y, z), (red, green, blue)) in enumerate(
+            zip(cloud.points.tolist(), cloud.rgb.tolist(), strict=True)
         )
     ]
     yield "sparse/0/cameras.txt", _text(["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", camera])
     yield "sparse/0/images.txt", _text(lines)
     yield (
         "sparse/0/points3D.txt",
-        _text(["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]: none", *points]),
+        _text(["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]", *points]),
     )
+
+
+def _seen(cloud: Cloud, every: int, picture: PlacedPicture, camera: Camera) -> tuple[Ints, Array]:
+    """Of each so many points those that a picture shows: numbers (N,) and pixels (N, 2)."""
+    pose, points = picture.pose.world_from_camera, cloud.points.astype(np.float64)
+    pixels, depth = projected(points, pose, camera)
+    nearest = depth_buffer(pixels, depth, camera)
+    faces = ((pose.translation - points) * cloud.normals).sum(1) >= 0.0  # or has no normal
+    some = np.arange(0, len(cloud), every)
+    some = some[(within(pixels, camera) & (depth > 0) & faces)[some]]
+    some = some[is_uncovered(pixels[some], depth[some], nearest)]
+    return some, pixels[some]
 
 
 def nerfstudio_files(pictures: FlightPictures) -> Iterator[tuple[str, bytes]]:

@@ -23,7 +23,7 @@ from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned
 from companion.geometry.transforms import Array, Pose, quaternion_from_euler
 from companion.geometry.transforms import rotation_from_quaternion as rotation
 from companion.messages import Bytes
-from companion.products.cloud import Cloud
+from companion.products.cloud import Cloud, joined
 from companion.products.export.exports import export_run
 from companion.products.export.flight_pictures import FlightPictures
 from companion.products.export.map_frame import map_frame
@@ -173,7 +173,33 @@ def test_colmap_reads_its_model(run: FinishedRun, tmp_path: Path) -> None:
         ours = CAMERA.project(pose(k).world_from_camera.inverse().apply(place[None]))[0]
         np.testing.assert_allclose(pixel, ours + 0.5, atol=1e-5)
         check_colour(folder / "images" / image.name, ours, place)
-    assert "without tracks" in (tmp_path / "colmap.accuracy.txt").read_text()
+    told = (tmp_path / "colmap.accuracy.txt").read_text()
+    assert "the pixels where pictures show them" in told
+
+
+def test_tracks_of_colmap_are_what_pictures_show(run: FinishedRun, tmp_path: Path) -> None:
+    """A roof hides the ground below it, and nothing shows the underside of another."""
+    ground = run.cloud
+    below = np.abs(ground.points[:, :2] - [4.0, 1.0]).max(1) <= 1.0
+    part = ground.part(below)
+    roof = replace(part, points=part.points + np.array([0, 0, -2], np.float32))
+    above = np.array([4, 0, -2], np.float32)
+    ceiling = replace(part, points=part.points + above, normals=-part.normals)
+    run = replace(run, cloud=joined([ground, roof, ceiling]))
+    (folder,) = export_run(run, tmp_path, ExportConfig(formats=("colmap",)), flight(run))
+    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+    lengths = np.array([model.points3D[i + 1].track.length() for i in range(len(run.cloud))])
+    on_roof = np.arange(len(ground), len(ground) + len(roof))
+    assert lengths[on_roof].min() >= 2
+    assert not lengths[on_roof[-1] + 1 :].any()
+    inner = np.abs(ground.points[:, :2] - [4.0, 1.0]).max(1) <= 0.25
+    assert not lengths[: len(ground)][inner].any()
+    assert lengths.max() == 6 and 1 not in lengths
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() < 0.01
+    for image in model.images.values():
+        seen = [each for each in image.points2D if each.has_point3D()]
+        assert len(seen) == len(image.points2D) > 100
 
 
 def test_nerfstudio_has_cameras_in_the_axes_of_opengl(run: FinishedRun, tmp_path: Path) -> None:
