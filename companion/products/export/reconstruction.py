@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, quaternion_from_rotation
+from companion.geometry.transforms import Array, Pose, quaternion_from_rotation
 from companion.messages import Bytes
 from companion.products.cloud import Cloud
 from companion.products.export.flight_pictures import FlightPictures, PlacedPicture, enu
@@ -40,49 +42,64 @@ def colmap_files(pictures: FlightPictures) -> Iterator[tuple[str, bytes]]:
         f"1 PINHOLE {k.width} {k.height} {k.fx:.9g} {k.fy:.9g} {k.cx + 0.5:.9g} {k.cy + 0.5:.9g}"
     )
     every = -(-len(cloud) // MOST_TRACKED) or 1
-    images, seen = [], []
+    names, poses, seen = [], [], []
     for picture in pictures.spaced(STEP):
-        seen.append(_seen(cloud, every, picture, pictures.camera))
-        images.append((picture.pose.world_from_camera.inverse(), _name(picture)))
-        yield f"images/{_name(picture)}", _jpeg(picture.rgb)
-    times_seen = np.bincount(np.concatenate([ids for ids, _ in seen]), minlength=len(cloud))
-    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[]"]
-    tracks: dict[int, list[str]] = {}
-    for n, ((camera_from_world, name), (ids, pixels)) in enumerate(
-        zip(images, seen, strict=True), 1
-    ):
-        turn = quaternion_from_rotation(camera_from_world.rotation)
-        numbers = " ".join(f"{v:.12g}" for v in (*turn, *camera_from_world.translation))
-        often = times_seen[ids] > 1  # seen once, a point tells nothing of the pictures
-        ids, pixels = ids[often].tolist(), (pixels[often] + 0.5).tolist()
-        shown = " ".join(f"{x:.2f} {y:.2f} {i + 1}" for i, (x, y) in zip(ids, pixels, strict=True))
-        lines += [f"{n} {numbers} 1 {name}", shown]
-        for place, i in enumerate(ids):
-            tracks.setdefault(i, []).append(f"{n} {place}")
-    points = [
-        " ".join([f"{i + 1} {x:.6g} {y:.6g} {z:.6g} {red} {green} {blue} 0", *tracks.get(i, ())])
-        for i, ((x, y, z), (red, green, blue)) in enumerate(
-            zip(cloud.points.tolist(), cloud.rgb.tolist(), strict=True)
-        )
-    ]
+        names.append(_name(picture))
+        poses.append(picture.pose.world_from_camera)
+        seen.append(_seen(cloud, every, poses[-1], k))
+        yield f"images/{names[-1]}", _jpeg(picture.rgb)
+    # seen once, a point tells nothing of the pictures
+    often = np.bincount(np.concatenate([each.points for each in seen]), minlength=len(cloud)) > 1
+    seen = [each.part(often[each.points]) for each in seen]
     yield "sparse/0/cameras.txt", _text(["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", camera])
-    yield "sparse/0/images.txt", _text(lines)
-    yield (
-        "sparse/0/points3D.txt",
-        _text(["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]", *points]),
-    )
+    yield "sparse/0/images.txt", _text(_image_lines(names, poses, seen))
+    yield "sparse/0/points3D.txt", _text(_point_lines(cloud, seen))
 
 
-def _seen(cloud: Cloud, every: int, picture: PlacedPicture, camera: Camera) -> tuple[Ints, Array]:
-    """Of each so many points those that a picture shows: numbers (N,) and pixels (N, 2)."""
-    pose, points = picture.pose.world_from_camera, cloud.points.astype(np.float64)
-    pixels, depth = projected(points, pose, camera)
+class _Seen(NamedTuple):
+    """Points of a cloud that a picture shows: numbers (N,), and pixels (N, 2)."""
+
+    points: Ints
+    pixels: Array
+
+    def part(self, mask: NDArray[np.bool_]) -> _Seen:
+        return _Seen(self.points[mask], self.pixels[mask])
+
+
+def _seen(cloud: Cloud, every: int, world_from_camera: Pose, camera: Camera) -> _Seen:
+    """Of each so many points those that a picture shows."""
+    places = cloud.points.astype(np.float64)
+    pixels, depth = projected(places, world_from_camera, camera)
     nearest = depth_buffer(pixels, depth, camera)
-    faces = ((pose.translation - points) * cloud.normals).sum(1) >= 0.0  # or has no normal
+    back = world_from_camera.translation - places
+    faces = (back * cloud.normals).sum(1) >= 0.0  # or has no normal
     some = np.arange(0, len(cloud), every)
     some = some[(within(pixels, camera) & (depth > 0) & faces)[some]]
     some = some[is_uncovered(pixels[some], depth[some], nearest)]
-    return some, pixels[some]
+    return _Seen(some, pixels[some])
+
+
+def _image_lines(names: list[str], poses: list[Pose], seen: list[_Seen]) -> list[str]:
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[]"]
+    for n, (name, pose, shown) in enumerate(zip(names, poses, seen, strict=True), 1):
+        camera_from_world = pose.inverse()
+        turn = quaternion_from_rotation(camera_from_world.rotation)
+        numbers = " ".join(f"{v:.12g}" for v in (*turn, *camera_from_world.translation))
+        at = zip((shown.pixels + 0.5).tolist(), (shown.points + 1).tolist(), strict=True)
+        lines += [f"{n} {numbers} 1 {name}", " ".join(f"{x:.2f} {y:.2f} {i}" for (x, y), i in at)]
+    return lines
+
+
+def _point_lines(cloud: Cloud, seen: list[_Seen]) -> list[str]:
+    tracks: list[list[str]] = [[] for _ in range(len(cloud))]
+    for n, shown in enumerate(seen, 1):
+        for place, i in enumerate(shown.points.tolist()):
+            tracks[i].append(f"{n} {place}")
+    rows = zip(cloud.points.tolist(), cloud.rgb.tolist(), tracks, strict=True)
+    return ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"] + [
+        " ".join([f"{n} {x:.6g} {y:.6g} {z:.6g} {red} {green} {blue} 0", *track])
+        for n, ((x, y, z), (red, green, blue), track) in enumerate(rows, 1)
+    ]
 
 
 def nerfstudio_files(pictures: FlightPictures) -> Iterator[tuple[str, bytes]]:
